@@ -130,8 +130,8 @@ def add_distributions(folder):
             lines += [f"[{group}]", *(f"{key} = {value}" for key, value in points.items())]
         (info / "entry_points.txt").write_text("\n".join(lines))
     sys.path.append(str(folder))
-    known = os.environ.get("PYTHONPATH")
-    paths = (folder, ROOT / "lab", ROOT / "viewers", *([known] if known else []))
+    search_path = os.environ.get("PYTHONPATH")
+    paths = (folder, ROOT / "lab", ROOT / "viewers", *([search_path] if search_path else []))
     os.environ["PYTHONPATH"] = os.pathsep.join(map(str, paths))
 
 
@@ -177,10 +177,10 @@ def pytest_runtest_teardown(item, nextitem):
 def pytest_collection():
     """Exclude objects from before the collection from garbage collection."""
     gc.disable()
-    found = yield
+    result = yield
     gc.freeze()
     gc.enable()
-    return found
+    return result
 
 
 def pytest_collection_modifyitems(items):

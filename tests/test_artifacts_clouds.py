@@ -99,10 +99,10 @@ def test_a_scan_comes_back_with_its_points():
     assert read.surface.fitted is read.surface.spread
     np.testing.assert_array_equal(read.surface.valid, was.surface.valid)
     assert was.surface.spread is not None
-    for got, had in ((read.surface, was.surface), (read.surface.spread, was.surface.spread)):
+    for response, had in ((read.surface, was.surface), (read.surface.spread, was.surface.spread)):
         # 160 m in 65535 steps of a power of two: 1/256 m
-        assert np.abs(got.points - had.points).max() <= 1 / 512 + 1e-5
-        turn = np.linalg.norm(got.normals - had.normals, axis=2)
+        assert np.abs(response.points - had.points).max() <= 1 / 512 + 1e-5
+        turn = np.linalg.norm(response.normals - had.normals, axis=2)
         assert np.degrees(turn.max()) < 1.0
     assert read.surface.spread.camera is None
 

@@ -53,16 +53,16 @@ def test_a_service_needs_neither_lab_nor_viewers(tmp_path):
         env={**os.environ, "PYTHONPATH": str(packages)}, capture_output=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["commands"] == list(COMMANDS)
-    code, error = found["train"]
+    body = json.loads(done.stdout)
+    assert body["commands"] == list(COMMANDS)
+    code, error = body["train"]
     assert code == 2
     assert "invalid choice: 'train'" in error
-    for code, error in found["scenes"]:
+    for code, error in body["scenes"]:
         assert code == 2
         assert error.count("\n") == 1
         assert error.endswith("In a clone, run: pip install ./viewers\n")
-    code, error = found["upload"]
+    code, error = body["upload"]
     assert code == 2
     assert "nowhere.png: The file or folder does not exist" in error
     assert not file.exists()

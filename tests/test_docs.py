@@ -101,7 +101,7 @@ def test_the_index_of_the_documentation_names_every_page():
 
 
 def test_documented_commands_are_known():
-    known, docs = parser(), ROOT / "docs"
+    commands, docs = parser(), ROOT / "docs"
     names = ("getting_started.md", "library.md", "troubleshooting.md")
     for page in (*map(docs.joinpath, names), *(docs / "sensors").glob("*.md")):
         text = page.read_text()
@@ -112,7 +112,7 @@ def test_documented_commands_are_known():
         assert own, page
         for line in own:
             arguments = shlex.split(line, comments=True)[1:]
-            assert known.parse_args(arguments).command == arguments[0]
+            assert commands.parse_args(arguments).command == arguments[0]
 
 
 def test_architecture_names_what_exists():

@@ -42,8 +42,8 @@ def test_a_name_stands_once_in_its_kind_and_functions_are_there():
 def test_every_depth_format_is_recognised_measured_and_read():
     assert set(DEPTH) == {one.name for one in formats_of("depth")}
     for name, data in DEPTH.items():
-        found = format_at(data, "depth", "map", "archive", "recording", "capture")
-        assert found.name == name
+        result = format_at(data, "depth", "map", "archive", "recording", "capture")
+        assert result.name == name
         assert size_of(data) == (3, 2)
         assert decode_samples(data).shape == (2, 3)
 

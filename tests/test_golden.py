@@ -95,8 +95,8 @@ def shortened(document):
         for status, response in operation["responses"].items()
         if status[0] != "2"  # what an operation is for is read with it
     )
-    for part, found in (("parameters", parameters), ("responses", responses)):
-        for (name, text), count in sorted(found.items(), key=lambda item: (-item[1], item[0])):
+    for part, result in (("parameters", parameters), ("responses", responses)):
+        for (name, text), count in sorted(result.items(), key=lambda item: (-item[1], item[0])):
             if count > 1:
                 shared[part].setdefault(name, json.loads(text))
     for operation in operations:
@@ -254,19 +254,19 @@ def test_an_answer():
     """A found place, and one that is another corner of the room."""
     signer = pipeline.open_signer("depth")
     query, *database = (pipeline.prepare(view(name), signer)[1] for name in VIEWS)
-    found = {}
+    results = {}
     for name, match in zip(list(VIEWS)[1:], database, strict=True):
         one = pipeline.validate(query, match, seed=7)
-        found[name] = {
+        results[name] = {
             "status": one.status, "strength": one.strength, "reason": one.reason,
             "overlap": round(one.overlap, 6), "plane_overlap": round(one.plane_overlap, 6),
             "T": None if one.T_match_query is None else one.T_match_query.round(6).tolist(),
         }  # fmt: skip
-    kept = json.loads("\n".join(golden("answer.json", json_text(found).splitlines())))
-    for name, now in found.items():
+    kept = json.loads("\n".join(golden("answer.json", json_text(results).splitlines())))
+    for name, now in results.items():
         assert (now["status"], now["strength"]) == (kept[name]["status"], kept[name]["strength"])
-    again, was = found["window again"], kept["window again"]
-    assert (again["status"], found["door"]["status"]) == ("accepted", "rejected")
+    again, was = results["window again"], kept["window again"]
+    assert (again["status"], results["door"]["status"]) == ("accepted", "rejected")
     np.testing.assert_allclose(again["T"], was["T"], atol=2e-4)
     assert again["overlap"] == pytest.approx(was["overlap"], abs=2e-3)
     assert again["plane_overlap"] == pytest.approx(was["plane_overlap"], abs=2e-3)

@@ -91,13 +91,13 @@ def test_information_of_a_covariance_in_other_axes():
     rng = np.random.default_rng(2)
     T = rigid(rng)
     covariance = positive(rng) * 1e-8
-    found = []
+    results = []
     for x in rng.multivariate_normal(np.zeros(6), covariance, 20_000):
         true = np.eye(4)
         true[:3, :3] = Rotation.from_rotvec(x[3:]).as_matrix() @ T[:3, :3]
         true[:3, 3] = T[:3, 3] + x[:3]
         xi = inverse(T) @ true
-        found.append([*xi[:3, 3], *Rotation.from_matrix(xi[:3, :3]).as_rotvec()])
+        results.append([*xi[:3, 3], *Rotation.from_matrix(xi[:3, :3]).as_rotvec()])
     expected = np.linalg.inv(information_of(covariance, T))
     # sampling leaves about 1 % of the largest
-    assert np.abs(np.cov(np.array(found).T) - expected).max() < 0.04 * np.abs(expected).max()
+    assert np.abs(np.cov(np.array(results).T) - expected).max() < 0.04 * np.abs(expected).max()

@@ -62,10 +62,10 @@ def test_two_matches_guide_the_rest_to_the_truth(walk):
 def test_guided_matches_make_the_pose_more_precise_and_are_no_votes(walk):
     geometries, poses = walk
     matches = asked_of(walk, [1, 2, 3, 4, 5], dict(enumerate(poses)))
-    found = localize([QueryFrame(geometries[0], matches)], poses)
-    assert (found.status, found.votes, len(found.members), found.guided) == ("found", 5, 5, 3)
-    assert found.reason.endswith("including 3 guided by other matches")
-    assert found.average.votes == 5
+    answer = localize([QueryFrame(geometries[0], matches)], poses)
+    assert (answer.status, answer.votes, len(answer.members), answer.guided) == ("found", 5, 5, 3)
+    assert answer.reason.endswith("including 3 guided by other matches")
+    assert answer.average.votes == 5
     # three weak matches elsewhere weigh 1.2: two strong ones do not outweigh that, five would
     elsewhere = poses[0].copy()
     elsewhere[0, 3] += 2.0

@@ -45,13 +45,13 @@ def test_a_long_function_says_why():
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
     ]
     assert len(functions) > 2_000
-    found = [
+    result = [
         f"{path}:{node.name} {code_lines(node)}"
         for path, node in functions
         if code_lines(node) > MOST_LINES
         and not re.search(r"^\s*Length: \S", ast.get_docstring(node) or "", re.MULTILINE)
     ]
-    assert found == []
+    assert result == []
 
 
 def imports(tree, known):

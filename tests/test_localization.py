@@ -106,12 +106,12 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank):
 def test_the_covariance_of_an_earlier_frame_refers_to_the_localized_frame(blank):
     """Its sensor is 2 m ahead in x, so its errors of rotation move the pose in y and z."""
     certain = replace(outcome(T=shifted(3.0)), covariance=np.eye(6) * 1e-4)
-    found = localize(
+    answer = localize(
         [QueryFrame(blank, []), QueryFrame(blank, [match(0, certain)], shifted(2.0))], ROWS
     )
-    np.testing.assert_allclose(found.average.T, shifted(1.0), atol=1e-12)
-    assert found.covariance is not None
-    np.testing.assert_allclose(np.diag(found.covariance)[:3], [1e-4, 5e-4, 5e-4], rtol=1e-6)
+    np.testing.assert_allclose(answer.average.T, shifted(1.0), atol=1e-12)
+    assert answer.covariance is not None
+    np.testing.assert_allclose(np.diag(answer.covariance)[:3], [1e-4, 5e-4, 5e-4], rtol=1e-6)
 
 
 def test_near_views_and_certain_matches_count_more(blank):
@@ -126,8 +126,8 @@ def test_near_views_and_certain_matches_count_more(blank):
             )
             for i, (row, deviation) in enumerate(zip(rows, deviations, strict=True))
         ]  # fmt: skip
-        found = by_pairs(blank, matches)
-        return float(found.average.T[0, 3])
+        answer = by_pairs(blank, matches)
+        return float(answer.average.T[0, 3])
 
     # equal separations: 4 parts of the first, 1 of the second
     assert located([1, 1], [0.01, 0.02]) == pytest.approx((4 * 0.03 + 0.06) / 5, abs=1e-3)
@@ -148,15 +148,15 @@ def test_near_views_and_certain_matches_count_more(blank):
 )
 def test_a_pose_is_found_where_it_outweighs_every_other(blank, here, there, status, alternatives):
     matches = seen_at(0.0, range(here)) + seen_at(5.0, range(here, here + there))
-    found = by_pairs(blank, matches)
-    assert (found.status, len(found.alternatives)) == (status, alternatives)
-    assert found.votes == here + there
+    answer = by_pairs(blank, matches)
+    assert (answer.status, len(answer.alternatives)) == (status, alternatives)
+    assert answer.votes == here + there
     if status == "found":
-        assert (found.average.support, found.average.T[0, 3]) == (here, pytest.approx(0.0))
+        assert (answer.average.support, answer.average.T[0, 3]) == (here, pytest.approx(0.0))
     else:
-        assert found.average is None
-        assert "less than twice the weight" in found.reason
-        others = [(alternative.support, alternative.T[0, 3]) for alternative in found.alternatives]
+        assert answer.average is None
+        assert "less than twice the weight" in answer.reason
+        others = [(alternative.support, alternative.T[0, 3]) for alternative in answer.alternatives]
         assert others == [(here, pytest.approx(0.0)), (there, pytest.approx(5.0))]
 
 
@@ -176,8 +176,8 @@ def test_weak_and_ambiguous_matches_weigh_less_and_still_compete(blank):
 
 def test_rejected_matches_do_not_vote(blank):
     lost = replace(outcome("rejected"), T_match_query=None, hypotheses=np.empty((0, 4, 4)))
-    found = by_pairs(blank, [*seen_at(0.0, [0]), match(1, outcome("rejected")), match(2, lost)])
-    assert (found.status, found.votes) == ("found", 1)
+    answer = by_pairs(blank, [*seen_at(0.0, [0]), match(1, outcome("rejected")), match(2, lost)])
+    assert (answer.status, answer.votes) == ("found", 1)
     assert by_pairs(blank, [match(1, outcome("rejected")), match(2, lost)]) is None
     assert by_pairs(blank, []) is None
 
@@ -187,17 +187,17 @@ def test_poses_of_one_parent_frame_are_compared(blank):
     parents = ["flat", "hall", "flat", "hall", "hall", "attic"]
     poses = [shifted(0.0, y=float(i)) for i in range(6)]
     matches = [match(i, outcome(T=inverse(poses[i]) @ shifted(0.01 * i))) for i in range(5)]
-    found = localize([QueryFrame(blank, matches)], poses, parents)
-    assert (found.parent, found.votes) == ("hall", 3)
-    assert found.average.T[0, 3] == pytest.approx((0.01 + 0.03 + 0.04) / 3)
-    found = localize([QueryFrame(blank, matches[:4])], poses, parents)
-    assert (found.parent, found.average.T[0, 3]) == ("flat", pytest.approx(0.01))
+    answer = localize([QueryFrame(blank, matches)], poses, parents)
+    assert (answer.parent, answer.votes) == ("hall", 3)
+    assert answer.average.T[0, 3] == pytest.approx((0.01 + 0.03 + 0.04) / 3)
+    answer = localize([QueryFrame(blank, matches[:4])], poses, parents)
+    assert (answer.parent, answer.average.T[0, 3]) == ("flat", pytest.approx(0.01))
 
 
 def test_five_votes_are_averaged(blank):
-    found = by_pairs(blank, [m for i in range(8) for m in seen_at(0.01 * i, [i])])
-    assert (found.average.votes, len(found.members), found.votes) == (5, 8, 8)
-    assert found.average.T[0, 3] == pytest.approx(0.02)
+    answer = by_pairs(blank, [m for i in range(8) for m in seen_at(0.01 * i, [i])])
+    assert (answer.average.votes, len(answer.members), answer.votes) == (5, 8, 8)
+    assert answer.average.T[0, 3] == pytest.approx(0.02)
 
 
 def test_a_copy_of_a_view_is_no_second_vote(blank):
@@ -206,8 +206,8 @@ def test_a_copy_of_a_view_is_no_second_vote(blank):
     both = [*seen_at(0.0, [0]), *seen_at(5.0, [1])]
     copy = match(12, outcome(T=inverse(rows[12]) @ shifted(0.0)))
     for matches in ([*both], [*both, copy], [*both, copy, copy]):
-        found = localize([QueryFrame(blank, matches)], rows)
-        assert (found.status, {a.support for a in found.alternatives}) == ("ambiguous", {1})
+        answer = localize([QueryFrame(blank, matches)], rows)
+        assert (answer.status, {a.support for a in answer.alternatives}) == ("ambiguous", {1})
     other = localize([QueryFrame(blank, [*both, *seen_at(0.0, [2])])], rows)
     assert other.status == "found"
 
@@ -376,13 +376,13 @@ def suggested_at(x, row, status="rejected"):
 def judged(matches, *places, query=WHOLE, prior=None, p=BY_HAND):
     """What comes of matches of the whole picture where the map has these."""
     frames = [QueryFrame(query, matches)]
-    found = localize(frames, ROWS, None, told_by(*places), prior, p, FIXED)
-    assert found is not None
-    return found
+    answer = localize(frames, ROWS, None, told_by(*places), prior, p, FIXED)
+    assert answer is not None
+    return answer
 
 
-def at_place(k, found):
-    return found.average is not None and np.allclose(found.average.T, shifted(APART * k))
+def at_place(k, answer):
+    return answer.average is not None and np.allclose(answer.average.T, shifted(APART * k))
 
 
 def near_place(k, deviation=0.1):
@@ -455,9 +455,9 @@ def test_evidence_by_hand():
         seen = replace(matches[row].validation, distinctness=distinctness)
         matches[row] = replace(matches[row], similarity=similarity, validation=seen)
     here = [picture((40, SAME)), picture((30, SAME), (10, FARTHER)), picture((40, SAME))]
-    found = judged(matches, here, [picture((10, SAME))])
-    assert found.status == "found"
-    [itself] = found.alternatives
+    answer = judged(matches, here, [picture((10, SAME))])
+    assert answer.status == "found"
+    [itself] = answer.alternatives
     evidence = itself.evidence
     # tiles 30 to 39 have two frames for them and one against, which leaves no violation
     assert (evidence.share, evidence.planes) == pytest.approx((40 / 60, 40.0))
@@ -468,7 +468,7 @@ def test_evidence_by_hand():
     assert (evidence.similarity, evidence.distinctness) == (0.7, 1.7)
     assert (evidence.rival, evidence.rival_weight) == pytest.approx((10 / 40, 0.4))
     assert itself.support == 3
-    assert found.evidence is evidence
+    assert answer.evidence is evidence
 
 
 @pytest.mark.parametrize(
@@ -483,16 +483,16 @@ def test_evidence_by_hand():
 def test_a_pose_is_found_where_its_confidence_is_enough(rival, confidence, status):
     matches = [*seen_at(0.0, [0, 1]), *(suggested_at(APART, row) for row in (5, 6))]
     places = [picture((40, SAME))], [picture((rival, SAME))]
-    found = judged(matches, *places)
-    assert found.status == status
-    assert found.confidence == pytest.approx(confidence, abs=1e-4)
-    assert found.evidence.rival == pytest.approx(rival / 40)
+    answer = judged(matches, *places)
+    assert answer.status == status
+    assert answer.confidence == pytest.approx(confidence, abs=1e-4)
+    assert answer.evidence.rival == pytest.approx(rival / 40)
     if status == "found":
-        assert (found.verified_by, at_place(0, found)) == ("matches", True)
+        assert (answer.verified_by, at_place(0, answer)) == ("matches", True)
         strict = replace(BY_HAND, confidence=0.995)
         assert judged(matches, *places, p=strict).status == "ambiguous"
     else:
-        assert found.reason.startswith("another pose explains the frame equally well")
+        assert answer.reason.startswith("another pose explains the frame equally well")
         lenient = replace(BY_HAND, confidence=0.95)
         again = judged(matches, *places, p=lenient)
         assert again.status == ("found" if rival == 24 else "ambiguous")
@@ -504,8 +504,8 @@ def test_a_confidence_that_equals_the_limit_suffices():
     for prior in (None, near_place(0)):
         least = judged(matches, *places, prior=prior).confidence
         for limit, by in ((least, "matches" if prior is None else "prior"), (least + 1e-9, None)):
-            found = judged(matches, *places, prior=prior, p=replace(BY_HAND, confidence=limit))
-            assert found.verified_by == by
+            answer = judged(matches, *places, prior=prior, p=replace(BY_HAND, confidence=limit))
+            assert answer.verified_by == by
     least = judged(matches, *places).confidence
     for limit, status in ((least, "ambiguous"), (least + 1e-9, "not_found")):
         assert judged(matches, *places, p=replace(BY_HAND, worth=limit)).status == status
@@ -514,10 +514,10 @@ def test_a_confidence_that_equals_the_limit_suffices():
 def test_alternatives_are_told_with_their_confidences_the_best_first():
     matches = [suggested_at(APART * k, row) for k in range(3) for row in (2 * k, 2 * k + 1)]
     places = [[picture((count, SAME))] for count in (36, 36, 12)]
-    found = judged(matches, *places)
-    assert (found.status, found.average) == ("ambiguous", None)
-    assert sorted(a.T[0, 3] for a in found.alternatives) == [0.0, APART, 2 * APART]
-    assert [a.confidence for a in found.alternatives] == pytest.approx([1 / 2.2] * 3, abs=1)
+    answer = judged(matches, *places)
+    assert (answer.status, answer.average) == ("ambiguous", None)
+    assert sorted(a.T[0, 3] for a in answer.alternatives) == [0.0, APART, 2 * APART]
+    assert [a.confidence for a in answer.alternatives] == pytest.approx([1 / 2.2] * 3, abs=1)
     few = judged(matches, [picture((36, SAME))], [picture((30, SAME))], [picture((8, SAME))])
     assert [alternative.T[0, 3] for alternative in few.alternatives] == [0.0, APART]
     assert few.alternatives[0].confidence > few.alternatives[1].confidence
@@ -531,21 +531,21 @@ def test_few_planes_and_violations_lower_a_confidence():
         (picture((38, SAME), (2, NEARER)), 5.0, "a pose fits, but 5%"),
         (picture((30, SAME), (2, FARTHER), (2, NEARER)), 1.923, "a pose fits, but 12%"),
     ):
-        found = judged(votes, [there])
-        assert found.confidence == pytest.approx(1 / (1 + math.exp(-logit)), abs=2e-3)
-        assert (found.status == "found") is (logit > 4.6)
-        assert found.evidence.acceptance == 1.0  # of two votes for one frame
-        assert found.status == "found" or found.reason.startswith(why)
+        answer = judged(votes, [there])
+        assert answer.confidence == pytest.approx(1 / (1 + math.exp(-logit)), abs=2e-3)
+        assert (answer.status == "found") is (logit > 4.6)
+        assert answer.evidence.acceptance == 1.0  # of two votes for one frame
+        assert answer.status == "found" or answer.reason.startswith(why)
 
 
 def test_a_pose_that_one_view_alone_suggests_is_not_sure():
     alone, other = seen_at(0.0, [0]), suggested_at(0.0, 5)
     for matches, status in ((alone, "ambiguous"), ([*alone, other], "found")):
-        found = judged(matches, [WHOLE] * 3)
-        assert found.status == status
-        assert [alternative.support for alternative in found.alternatives] == [1]
-        assert (found.evidence.rival, found.evidence.rival_weight) == (0.0, 0.0)
-        assert status == "found" or "views of the place suggests this pose" in found.reason
+        answer = judged(matches, [WHOLE] * 3)
+        assert answer.status == status
+        assert [alternative.support for alternative in answer.alternatives] == [1]
+        assert (answer.evidence.rival, answer.evidence.rival_weight) == (0.0, 0.0)
+        assert status == "found" or "views of the place suggests this pose" in answer.reason
     assert judged(alone, [WHOLE]).evidence.acceptance == 1.0  # the only frame
 
 
@@ -563,8 +563,8 @@ def test_violations_that_the_map_shows_of_itself_are_borne(same, missing, unlike
         picture((same, SAME), (missing, FARTHER), (unlike, away)) for away in (SAME, FARTHER)
     ]  # fmt: skip
     noisy = replace(BY_HAND, map=MapParameters(n_refining=0), worth=0.0)
-    found = judged(seen_at(0.0, [0]), frames, query=query, p=noisy)
-    assert found.alternatives[0].evidence.excess == pytest.approx(excess)
+    answer = judged(seen_at(0.0, [0]), frames, query=query, p=noisy)
+    assert answer.alternatives[0].evidence.excess == pytest.approx(excess)
 
 
 @pytest.mark.parametrize(
@@ -604,9 +604,9 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank):
     weak = seen_at(0.0, [0, 1, 2], "weak")
     lost = replace(blank, surface=replace(blank.surface, camera=None))
     for geometry, status in ((blank, "ambiguous"), (lost, "found")):
-        found = localize([QueryFrame(geometry, weak)], ROWS)
-        assert found.status == status
-    assert (found.strength, found.verified_by) == ("weak", "matches")
+        answer = localize([QueryFrame(geometry, weak)], ROWS)
+        assert answer.status == status
+    assert (answer.strength, answer.verified_by) == ("weak", "matches")
     unsure = [suggested_at(0.0, row, "ambiguous") for row in range(3)]
     none = localize([QueryFrame(lost, unsure)], ROWS)
     assert (none.status, none.reason) == ("ambiguous", "no match is accepted")
@@ -614,11 +614,11 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank):
 
 def test_the_map_alone_may_decide_where_no_match_votes():
     suggested = [suggested_at(0.0, 0), suggested_at(0.0, 2)]
-    found = judged(suggested, [WHOLE] * 8, [picture((10, SAME))])
-    assert (found.status, found.verified_by, found.strength) == ("found", "map", "weak")
-    assert at_place(0, found)
-    [itself] = found.alternatives
-    assert (itself.support, found.votes) == (0, 0)
+    located = judged(suggested, [WHOLE] * 8, [picture((10, SAME))])
+    assert (located.status, located.verified_by, located.strength) == ("found", "map", "weak")
+    assert at_place(0, located)
+    [itself] = located.alternatives
+    assert (itself.support, located.votes) == (0, 0)
     # what a caller asks of matches, a pose without the vote of one does not meet
     strict = replace(BY_HAND, voted_only=True)
     answer = judged(suggested, [WHOLE] * 8, p=strict)
@@ -640,16 +640,16 @@ def test_the_first_poses_of_all_candidates_come_before_their_second():
     matches = [match(0, both), suggested_at(2 * APART, 1)]
     for n, at in ((2, [0.0, 2 * APART]), (3, [0.0, APART, 2 * APART])):
         p = replace(BY_HAND, map=replace(BY_HAND.map, n_poses=n))
-        found = judged(matches, *[[WHOLE]] * 3, p=p)
-        assert sorted(place.T[0, 3] for place in found.places) == at
+        answer = judged(matches, *[[WHOLE]] * 3, p=p)
+        assert sorted(place.T[0, 3] for place in answer.places) == at
 
 
 def test_a_place_that_the_map_does_not_show_loses_to_any_rival():
     matches = [*seen_at(0.0, [0, 1]), *seen_at(APART, [2])]
     for hopeful, excess in ((0.0, 0.0), (0.2, 1.0)):
         p = replace(BY_HAND, map=replace(BY_HAND.map, hopeful=hopeful))
-        found = judged(matches, [WHOLE], [picture()], p=p)
-        [here, there] = sorted(found.places, key=lambda place: place.T[0, 3])
+        answer = judged(matches, [WHOLE], [picture()], p=p)
+        [here, there] = sorted(answer.places, key=lambda place: place.T[0, 3])
         assert (here.evidence.rival, here.evidence.rival_weight) == (0.0, 1.0)
         assert (there.evidence.rival, there.evidence.rival_weight) == (1.0, 2.0)
         assert (there.evidence.score, there.evidence.frames, there.score) == (0.0, 0, 0.0)
@@ -669,9 +669,9 @@ def test_where_no_match_is_accepted_the_pose_is_that_of_the_map():
     aside = inverse(ROWS[0])
     aside[2, 3] = 0.2
     unsure = match(0, outcome("ambiguous", T=aside))
-    found = judged([unsure, suggested_at(0.0, 1)], [WHOLE] * 8)
-    assert (found.status, found.verified_by) == ("found", "map")
-    assert at_place(0, found)
+    answer = judged([unsure, suggested_at(0.0, 1)], [WHOLE] * 8)
+    assert (answer.status, answer.verified_by) == ("found", "map")
+    assert at_place(0, answer)
 
 
 @pytest.mark.parametrize(
@@ -689,18 +689,18 @@ def test_a_prior_decides_for_what_the_map_bears_out(same, farther, elsewhere, co
     matches = [suggested_at(APART * k, row) for k in range(2) for row in (k, 2 + k)]
     places = [picture((elsewhere, SAME))], [picture((same, SAME), (farther, FARTHER))]
     assert judged(matches, *places).status != "found"
-    found = judged(matches, *places, prior=near_place(1))
-    assert (found.status == "found") is confirmed
-    assert (found.verified_by == "prior") is confirmed
-    assert at_place(1, found) is confirmed
+    answer = judged(matches, *places, prior=near_place(1))
+    assert (answer.status == "found") is confirmed
+    assert (answer.verified_by == "prior") is confirmed
+    assert at_place(1, answer) is confirmed
 
 
 @pytest.mark.parametrize(("second", "confirmed"), [(18, True), (25, False)])
 def test_a_prior_does_not_decide_between_poses_that_it_expects(second, confirmed):
     matches = [suggested_at(APART * k, row) for k in (0, 1, 5) for row in (k, 6 + k)]
     places = [[picture((36, SAME))], [picture((second, SAME))], [], [], [], [picture((36, SAME))]]
-    found = judged(matches, *places, prior=near_place(0, deviation=30.0))
-    assert at_place(0, found) is confirmed  # half of 36 costs 1, and seven tenths 2.9
+    answer = judged(matches, *places, prior=near_place(0, deviation=30.0))
+    assert at_place(0, answer) is confirmed  # half of 36 costs 1, and seven tenths 2.9
     assert judged(matches, *places, prior=near_place(0)).verified_by == "prior"
 
 
@@ -718,9 +718,9 @@ def test_a_prior_does_not_decide_between_poses_that_it_expects(second, confirmed
 def test_a_prior_decides_where_another_pose_fits_as_well(expected, other, decided):
     matches = [*seen_at(0.0, [0, 1]), suggested_at(APART, 8), suggested_at(APART, 9)]
     places = [picture((40, SAME))], [picture((other, SAME))]
-    found = judged(matches, *places, prior=near_place(expected))
-    at = next((k for k in (0, 1) if at_place(k, found)), None)
-    assert (found.status, found.verified_by, at) == decided
+    answer = judged(matches, *places, prior=near_place(expected))
+    at = next((k for k in (0, 1) if at_place(k, answer)), None)
+    assert (answer.status, answer.verified_by, at) == decided
 
 
 def test_a_prior_chooses_the_parent_frame_unless_matches_have():
@@ -730,8 +730,8 @@ def test_a_prior_chooses_the_parent_frame_unless_matches_have():
     def answer(matches, parent, x=0.0):
         prior = PosePrior(parent, shifted(x), np.eye(6) * 0.01)
         frames = [QueryFrame(WHOLE, matches)]
-        found = localize(frames, ROWS[:5], parents, views_of, prior, BY_HAND, FIXED)
-        return found.status, found.parent, found.verified_by
+        answer = localize(frames, ROWS[:5], parents, views_of, prior, BY_HAND, FIXED)
+        return answer.status, answer.parent, answer.verified_by
 
     tried = [suggested_at(0.0, row) for row in range(5)]  # three of them here
     assert answer(tried, "here")[1] == "here"
@@ -750,8 +750,8 @@ def test_the_parent_frame_is_that_of_the_strongest_matches(blank):
     weak, strong = seen_at(0.0, [0, 1], "weak"), seen_at(0.0, [2])
     tried = [suggested_at(0.0, 0), suggested_at(0.0, 1)]
     for matches in ([*weak, *strong], [*tried, *seen_at(0.0, [2], "weak")]):
-        found = localize([QueryFrame(blank, matches)], ROWS[:3], parents)
-        assert (found.parent, found.votes) == ("there", 1)
+        answer = localize([QueryFrame(blank, matches)], ROWS[:3], parents)
+        assert (answer.parent, answer.votes) == ("there", 1)
 
 
 @pytest.mark.parametrize(("cost", "confirmed"), [(6.2, True), (6.6, False)])
@@ -759,8 +759,8 @@ def test_a_prior_stands_for_a_second_view_and_for_odds_of_twenty(cost, confirmed
     """Odds of 20 e^1.8 reach .99, and odds of 20 e^1.4 do not; with a third view both would."""
     costs = replace(_OF_FRAMES, suggested=Penalty(8.0, 8.0, cost))
     p = replace(BY_HAND, judgement=ConfidenceModel(costs, costs))
-    found = judged([suggested_at(0.0, 0)], [WHOLE] * 3, prior=near_place(0), p=p)
-    assert (found.verified_by == "prior") is confirmed
+    answer = judged([suggested_at(0.0, 0)], [WHOLE] * 3, prior=near_place(0), p=p)
+    assert (answer.verified_by == "prior") is confirmed
 
 
 def test_a_prior_may_confirm_the_best_of_equal_poses_alone():
@@ -768,10 +768,10 @@ def test_a_prior_may_confirm_the_best_of_equal_poses_alone():
     best = replace(BY_HAND, prior_share=1.0)
     for second, confirmed in ((36, True), (35, False)):
         places = [picture((36, SAME))], [picture((second, SAME))]
-        found = judged(matches, *places, prior=near_place(1), p=best)
-        assert (found.verified_by == "prior") is confirmed
+        answer = judged(matches, *places, prior=near_place(1), p=best)
+        assert (answer.verified_by == "prior") is confirmed
         # the only pose that the prior expects has no rival
-        assert not confirmed or (found.evidence.rival, found.evidence.rival_weight) == (0.0, 0.0)
+        assert not confirmed or (answer.evidence.rival, answer.evidence.rival_weight) == (0.0, 0.0)
 
 
 def test_the_parent_frame_of_rejected_matches_is_that_of_most():
@@ -780,8 +780,8 @@ def test_the_parent_frame_of_rejected_matches_is_that_of_most():
         parents, parent = ["there", middle, "here"], middle
         views_of = told_by([WHOLE] * 3, parent=parent)
         frames = [QueryFrame(WHOLE, tried)]
-        found = localize(frames, ROWS[:3], parents, views_of, None, BY_HAND, FIXED)
-        assert (found.status, found.parent) == ("found", parent)
+        answer = localize(frames, ROWS[:3], parents, views_of, None, BY_HAND, FIXED)
+        assert (answer.status, answer.parent) == ("found", parent)
 
 
 def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(box_views, signer):
@@ -792,9 +792,9 @@ def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(box_views, signer):
     off[:3, 3] += 0.1, -0.1, 0.05
     prior = PosePrior("", off, np.diag([0.1**2] * 3 + [0.05**2] * 3))
     views_of = views_of_rows([], poses, views.__getitem__)
-    found = localize([QueryFrame(query, [])], poses, None, views_of, prior)
-    assert (found.status, found.votes) == ("found", 0)
-    np.testing.assert_allclose(found.average.T, T, atol=0.03)
+    answer = localize([QueryFrame(query, [])], poses, None, views_of, prior)
+    assert (answer.status, answer.votes) == ("found", 0)
+    np.testing.assert_allclose(answer.average.T, T, atol=0.03)
 
 
 def test_starts_lie_a_deviation_about_a_prior():
@@ -815,15 +815,15 @@ def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank):
     alone = by_pairs(blank, [*last, *seen_at(9.0, [3])])
     assert alone.status == "ambiguous"
     frames = [QueryFrame(blank, first, before), QueryFrame(blank, [*last, *seen_at(9.0, [3])])]
-    found = localize(frames, ROWS)
-    assert (found.status, found.average.support, found.votes) == ("found", 3, 4)
-    np.testing.assert_allclose(found.average.T, truth, atol=1e-12)
+    answer = localize(frames, ROWS)
+    assert (answer.status, answer.average.support, answer.votes) == ("found", 3, 4)
+    np.testing.assert_allclose(answer.average.T, truth, atol=1e-12)
 
 
 def test_the_best_matches_of_all_frames_vote_first(blank):
     before = QueryFrame(blank, seen_at(0.0, [0, 1], "weak"))
-    found = localize([before, QueryFrame(blank, seen_at(0.0, [2]))], ROWS)
-    assert (found.status, found.members) == ("found", (2, 0, 1))
+    answer = localize([before, QueryFrame(blank, seen_at(0.0, [2]))], ROWS)
+    assert (answer.status, answer.members) == ("found", (2, 0, 1))
 
 
 def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last():
@@ -834,11 +834,11 @@ def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last():
     for planes, status in ((6, "ambiguous"), (12, "found")):
         map_frames = [picture((planes, SAME))] * 4
         views_of = told_by(map_frames, map_frames)
-        found = localize(
+        answer = localize(
             [before, QueryFrame(query, [])], ROWS, None, views_of, None, BY_HAND, FIXED
         )
-        assert found.status == status
-    assert (found.verified_by, at_place(1, found)) == ("map", True)
+        assert answer.status == status
+    assert (answer.verified_by, at_place(1, answer)) == ("map", True)
 
 
 def test_a_prior_reaches_frames_within_sight_and_three_deviations():
@@ -968,8 +968,8 @@ def test_guided_matches_are_searched_where_no_pose_is_found(blank):
         QueryFrame(blank, [*seen_at(0.0, [0]), guided_at(0.0, 1), *seen_at(5.0, [2])]),
     ]
     shelf = Shelf([*seen_at(0.0, [0, 1]), *seen_at(5.0, [2])])
-    found = decided(frames, shelf)
-    assert (found.status, found.members, found.guided) == ("found", (0, 1), 0)
+    answer = decided(frames, shelf)
+    assert (answer.status, answer.members, answer.guided) == ("found", (0, 1), 0)
     assert shelf.searched == [(1, [0, 2])]
     late = decided(frames, Shelf(None))  # the deadline has passed
     assert (late.status, len(late.alternatives)) == ("ambiguous", 2)
@@ -977,8 +977,8 @@ def test_guided_matches_are_searched_where_no_pose_is_found(blank):
 
 def test_guided_matches_of_a_found_pose_are_not_searched(blank):
     shelf = Shelf([])
-    found = decided([QueryFrame(blank, [*seen_at(0.0, [0]), guided_at(0.0, 1)])], shelf)
-    assert (found.status, found.guided, shelf.searched) == ("found", 1, [])
+    answer = decided([QueryFrame(blank, [*seen_at(0.0, [0]), guided_at(0.0, 1)])], shelf)
+    assert (answer.status, answer.guided, shelf.searched) == ("found", 1, [])
     lost = replace(guided_at(0.0, 1), validation=replace(outcome("rejected"), predicted=np.eye(4)))
     assert decided([QueryFrame(blank, [lost])], shelf) is None
     assert (shelf.searched, shelf.compared) == ([], [])

@@ -54,8 +54,8 @@ def box_pairs(n, seed):
 def overlapping(recording, n, seed):
     """`n` pairs of every 20th frame of a recording that overlap by half, the smaller direction."""
     frames = [reference.read_depth() for reference in recording[::20]]
-    found = [(p.query, p.match) for p in pairs_among(frames) if p.overlap >= 0.5]
-    return [found[i] for i in np.random.default_rng(seed).permutation(len(found))[:n]]
+    result = [(p.query, p.match) for p in pairs_among(frames) if p.overlap >= 0.5]
+    return [result[i] for i in np.random.default_rng(seed).permutation(len(result))[:n]]
 
 
 def geometry(frame, model):

@@ -28,18 +28,18 @@ def queried(expression):
 
 
 def check(expression):
-    known = families()
-    found = queried(expression)
+    metrics = families()
+    result = queried(expression)
     by = set(re.findall(r"\w+", " ".join(re.findall(r"\bby \(([^)]*)\)", expression))))
     labels = set()
-    for name, picked in found:
+    for name, picked in result:
         family = re.sub(r"_(bucket|sum|count)$", "", name)
-        assert family in known, expression
+        assert family in metrics, expression
         if family != name:
-            assert name not in known
+            assert name not in metrics
             labels.add("le")
-        assert picked - {"job"} <= known[family], expression
-        labels |= known[family]
+        assert picked - {"job"} <= metrics[family], expression
+        labels |= metrics[family]
     assert by <= labels, expression
 
 

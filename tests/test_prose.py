@@ -31,11 +31,11 @@ def sentences(page):
     page = re.sub(r"`[^`]*`|\[[\w/]+\.md\]\([^)]*\)", "code", page)
     page = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", page)
     page = re.sub(r"\be\.g\.|\bi\.e\.", "such as", page)
-    found = []
+    results = []
     for part in re.split(r"\n\s*\n|\n(?=\s*(?:[*-]|\d+\.) )", page):
         text = re.sub(r"^\s*(?:[*-]|\d+\.) ", "", part)
-        found += re.split(r"(?<=[.!?])[)*\"]*\s+(?=[A-Z\d(*\"]|code)", " ".join(text.split()))
-    return [one for one in found if re.search(r"\w", one)]
+        results += re.split(r"(?<=[.!?])[)*\"]*\s+(?=[A-Z\d(*\"]|code)", " ".join(text.split()))
+    return [one for one in results if re.search(r"\w", one)]
 
 
 def words(sentence):
@@ -47,7 +47,7 @@ def test_pages_are_in_short_sentences_that_readers_do_not_stumble_over(page):
     text = page.read_text()
     # no index has our distributions: pip would find nothing, or a package of another owner
     assert re.findall(r"pip install (?:-\S+ )*['\"]?sceneprint", text) == []
-    found = sentences(text)
-    assert [one for one in found if words(one) > MOST_WORDS] == []
-    assert median(map(words, found)) <= MEDIAN_WORDS
-    assert STUMBLES.findall(" ".join(found)) == []
+    result = sentences(text)
+    assert [one for one in result if words(one) > MOST_WORDS] == []
+    assert median(map(words, result)) <= MEDIAN_WORDS
+    assert STUMBLES.findall(" ".join(result)) == []

@@ -92,12 +92,12 @@ def test_retrieval(data_root, paper):
 
 def psi_of(frames, signer):
     """(N, D) psi before any rounding."""
-    found = []
+    results = []
     for frame in frames:
         patches = describe(frame, signer.model.parameters).levels
         statistics = [table_statistics(patches[level], signer) for level in signer.model.levels]
-        found.append(float_signature(statistics, signer.model, frame.name))
-    return np.stack(found)
+        results.append(float_signature(statistics, signer.model, frame.name))
+    return np.stack(results)
 
 
 def test_another_rooms_frame_is_farther(signer, room_frames):

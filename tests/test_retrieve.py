@@ -52,11 +52,11 @@ def test_retrieve_by_hand(model_a):
     query = signature(10, 10, 10)
     rows = ((10, 10, 13), (255, 0, 0), (10, 9, 10), (7, 10, 10))
     database = [signature(*row) for row in rows]
-    found = retrieve(query, database, model_a)
-    assert found.indices.tolist() == [2, 0, 3, 1]
-    assert found.distances.tolist() == [1, 3, 3, 265]
+    ranking = retrieve(query, database, model_a)
+    assert ranking.indices.tolist() == [2, 0, 3, 1]
+    assert ranking.distances.tolist() == [1, 3, 3, 265]
     # d0 of the model is 1000
-    np.testing.assert_allclose(found.similarities, [0.999, 0.997, 0.997, 0.735])
+    np.testing.assert_allclose(ranking.similarities, [0.999, 0.997, 0.997, 0.735])
     assert retrieve(query, database, model_a, 2).indices.tolist() == [2, 0]
     assert retrieve(query, database, model_a, 0).indices.tolist() == []
 
@@ -69,12 +69,12 @@ def test_how_many_are_retrieved(model_a):
 
 def test_an_empty_database(model_a):
     for size in (None, 0, 5):
-        found = retrieve(signature(1, 2, 3), [], model_a, size)
-        assert len(found) == 0
-        assert (found.distances.dtype, found.similarities.shape) == (np.int64, (0,))
-        chosen = diversify(found, [], 10)
+        ranking = retrieve(signature(1, 2, 3), [], model_a, size)
+        assert len(ranking) == 0
+        assert (ranking.distances.dtype, ranking.similarities.shape) == (np.int64, (0,))
+        chosen = diversify(ranking, [], 10)
         assert (chosen.indices.tolist(), chosen.gains.tolist()) == ([], [])
-        assert associate(never(), found, [], unopened) == []
+        assert associate(never(), ranking, [], unopened) == []
 
 
 def test_signatures_of_two_models_are_not_compared(model_a):
@@ -95,15 +95,15 @@ def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a):
     database = [signature(*rng.integers(0, 256, 30).tolist()) for _ in range(25)]
     database += database[:5]  # and duplicates, which add nothing
     query = signature(*rng.integers(0, 256, 30).tolist())
-    found = retrieve(query, database, model_a, 20)
-    rows = np.array([database[i].vector for i in found.indices], int)
+    ranking = retrieve(query, database, model_a, 20)
+    rows = np.array([database[i].vector for i in ranking.indices], int)
     among = np.abs(rows[:, None] - rows[None]).sum(axis=2)
-    chosen = diversify(found, database, 6)
-    expected = select(found.distances.astype(float), among.astype(float), 6)
+    chosen = diversify(ranking, database, 6)
+    expected = select(ranking.distances.astype(float), among.astype(float), 6)
     assert chosen.indices.tolist() == expected.indices.tolist()
     np.testing.assert_array_equal(chosen.gains, expected.gains)
     assert chosen.indices[0] == 0
-    assert len(diversify(found, database).indices) == 10
+    assert len(diversify(ranking, database).indices) == 10
 
 
 def test_prepare_is_sign_and_geometry_of_one_look(small_signer, room_frames):
@@ -164,18 +164,18 @@ def test_candidates_are_tried_in_order_until_enough(small_model, walk):
         opened.append(index)
         return rows[index]
 
-    found = associate(query, ranking, [0, 1, 2, 3], row, 2, 7)
+    matches = associate(query, ranking, [0, 1, 2, 3], row, 2, 7)
     assert opened == [40, 10, 30]  # enough: the last is not looked at
     # those accepted, what shares most first, then what was not
-    assert [m.index for m in found] == [30, 10, 40]
-    assert [m.validation.status for m in found] == ["accepted", "accepted", "rejected"]
-    assert [m.distance for m in found] == [30, 20, 10]
-    assert [m.similarity for m in found] == pytest.approx([0.97, 0.98, 0.99])
-    assert [m.validation.seed for m in found] == [7, 7, 7]
+    assert [m.index for m in matches] == [30, 10, 40]
+    assert [m.validation.status for m in matches] == ["accepted", "accepted", "rejected"]
+    assert [m.distance for m in matches] == [30, 20, 10]
+    assert [m.similarity for m in matches] == pytest.approx([0.97, 0.98, 0.99])
+    assert [m.validation.seed for m in matches] == [7, 7, 7]
     alone = validate(query, far, 7)
     assert alone.T_match_query is not None
-    assert found[1].validation.T_match_query is not None
-    np.testing.assert_array_equal(found[1].validation.T_match_query, alone.T_match_query)
+    assert matches[1].validation.T_match_query is not None
+    np.testing.assert_array_equal(matches[1].validation.T_match_query, alone.T_match_query)
     # the paper's test tells nothing of strength
     (only,) = associate(query, ranking, [2], row, 1, 7, mode="paper")
     assert (only.validation.status, only.validation.strength) == ("accepted", "strong")

@@ -15,12 +15,12 @@ def test_a_file_holds_what_its_variable_would(tmp_path):
     password, other = tmp_path / "password", tmp_path / "other"
     password.write_bytes(b" pass word\r\n")
     other.write_text("s3cret")
-    given = {
+    variables = {
         "PGPASSWORD_FILE": str(password), "AWS_SECRET_ACCESS_KEY_FILE": str(other),
         "SSL_CERT_FILE": "/none", "PGUSER_FILE": "/none", "AWS_ACCESS_KEY_ID_FILE": "",
     }  # fmt: skip
-    read_secret_files(given)
-    assert given == {
+    read_secret_files(variables)
+    assert variables == {
         "PGPASSWORD": " pass word", "AWS_SECRET_ACCESS_KEY": "s3cret",
         "SSL_CERT_FILE": "/none", "PGUSER_FILE": "/none", "AWS_ACCESS_KEY_ID_FILE": "",
     }  # fmt: skip
@@ -45,10 +45,10 @@ def test_what_is_no_secret_is_refused_and_never_shown(tmp_path):
 def test_every_command_reads_them(command, tmp_path):
     path = tmp_path / "url"
     path.write_text("nothing://robot:hunter2@host/name\n")
-    given = {**os.environ, "SCENEPRINT_DATABASE_URL_FILE": str(path), "SCENEPRINT_PORT": "0"}
-    given.pop("SCENEPRINT_DATABASE_URL", None)
+    settings = {**os.environ, "SCENEPRINT_DATABASE_URL_FILE": str(path), "SCENEPRINT_PORT": "0"}
+    settings.pop("SCENEPRINT_DATABASE_URL", None)
     done = subprocess.run(
-        [sys.executable, "-m", *command], env=given, capture_output=True, text=True,
+        [sys.executable, "-m", *command], env=settings, capture_output=True, text=True,
         timeout=PATIENCE_S, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 2

@@ -74,10 +74,10 @@ def assert_sound(figures):
 def test_kills_and_a_full_disk_lose_nothing(tmp_path, recording, monkeypatch):
     monkeypatch.setattr(faults, "FULL_S", 2.0)
     full = int(os.geteuid() == 0)  # who may mount a disk
-    found = drive(tmp_path, replace(SMALL, data=recording, faults={"kill": 3, "full-disk": full}))
-    assert_sound(found)
-    assert (found.kills.total(), found.kills[FULL]) == (3 + full, full)
-    assert found.deleted > 0
+    report = drive(tmp_path, replace(SMALL, data=recording, faults={"kill": 3, "full-disk": full}))
+    assert_sound(report)
+    assert (report.kills.total(), report.kills[FULL]) == (3 + full, full)
+    assert report.deleted > 0
 
 
 @pytest.mark.thorough
@@ -88,21 +88,21 @@ def test_a_fleet_loses_nothing_whatever_becomes_of_it(tmp_path, recording, monke
     except NoServer as error:
         pytest.skip(str(error))
     monkeypatch.setattr(faults, "CUT_OFF_S", 6.0)
-    found = drive(tmp_path, replace(HARD, data=recording))
-    assert_sound(found)
-    assert (found.kills[CUT_OFF], found.kills[FROZEN], found.spooled) == (1, 1, 5)
-    assert found.kills[PRIMARY] == 1
-    [promotion] = found.promotions
+    report = drive(tmp_path, replace(HARD, data=recording))
+    assert_sound(report)
+    assert (report.kills[CUT_OFF], report.kills[FROZEN], report.spooled) == (1, 1, 5)
+    assert report.kills[PRIMARY] == 1
+    [promotion] = report.promotions
     assert promotion.unreceived == frozenset()
-    assert 0 < found.locks.one_map < found.locks.seconds
+    assert 0 < report.locks.one_map < report.locks.seconds
 
 
 @pytest.mark.thorough
 def test_every_operation_answers_as_declared(tmp_path, shots):
-    found = call_as_everybody(tmp_path, shots[:2], examples=2, phases="fuzzing")
-    assert [one.report[-2000:] for one in found if not one.sound] == []
-    assert len(found) == 5
-    assert all(one.requests > one.operations >= 40 for one in found[:4])
+    report = call_as_everybody(tmp_path, shots[:2], examples=2, phases="fuzzing")
+    assert [one.report[-2000:] for one in report if not one.sound] == []
+    assert len(report) == 5
+    assert all(one.requests > one.operations >= 40 for one in report[:4])
 
 
 def test_what_is_lost_is_seen(tmp_path, shots, monkeypatch):
@@ -125,14 +125,14 @@ def test_what_is_lost_is_seen(tmp_path, shots, monkeypatch):
         client_of_nobody = FailoverClient(["http://127.0.0.1:1"], RequestLog())
         listener = Listener("fleet", "secret", client_of_nobody, RequestLog())
         listener.heard["frame.received", kept[0].frame_id] = 2
-        found = check(ledger, [kept[0].frame_id], [client, client], [listener])
+        result = check(ledger, [kept[0].frame_id], [client, client], [listener])
         ages = {"fleet": 10.0}
         for at, missing in ((9.0, {kept[1].frame_id}), (10.0, set[str]())):
             listener.retired = {kept[1].frame_id: at}  # its robot began to send it at 0
             aged = check(ledger, [kept[0].frame_id], [client, client], [listener], ages)
             assert (aged.missing, aged.aged, aged.looked_up) == (missing, 1 - len(missing), 0)
-    assert found.wrong
-    assert replace(found, wrong=[]) == AuditCounts(
+    assert result.wrong
+    assert replace(result, wrong=[]) == AuditCounts(
         acknowledged=4, indexed=2, looked_up=2, found=1, missing={kept[1].frame_id}, returned=1,
         stuck=1, strangers=1, unheard=2, heard_twice=1, searches=2,
     )  # fmt: skip

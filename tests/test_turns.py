@@ -11,7 +11,7 @@ from sceneprint.turns import ACTIVE_S, PRESENT_S, ThreadTurns, TurnOrder
 
 def queue(turns, tenants, order):
     """Threads that wait for a turn in that order, and note when they have had it."""
-    found = []
+    results = []
 
     def take(tenant):
         assert turns.acquire(tenant, 60)
@@ -21,9 +21,9 @@ def queue(turns, tenants, order):
     for number, tenant in enumerate(tenants):
         thread = threading.Thread(target=take, args=(tenant,))
         thread.start()
-        found.append(thread)
+        results.append(thread)
         await_waiting(turns, number + 1)
-    return found
+    return results
 
 
 def await_waiting(turns, count):

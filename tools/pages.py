@@ -82,14 +82,14 @@ def _row(name: str, field: FieldInfo) -> tuple[str, ...]:
 def _type_of(field: FieldInfo) -> str:
     """Return the type of a setting's value in words."""
     kinds = {Path: "path", SecretStr: "text", str: "text", int: "whole number", float: "number"}
-    found = [
+    result = [
         one for one in (get_args(field.annotation) or [field.annotation]) if one is not type(None)
     ]
-    if all(isinstance(one, str) for one in found):
-        return " or ".join(map(code, found))
-    if found[0] is bool:
+    if all(isinstance(one, str) for one in result):
+        return " or ".join(map(code, result))
+    if result[0] is bool:
         return "`true` or `false`"
-    return "list" if Ellipsis in found else kinds[found[0]]
+    return "list" if Ellipsis in result else kinds[result[0]]
 
 
 def _default_text(name: str, default: object) -> str:

@@ -113,7 +113,7 @@ def check(
     looked_up = lasting[:: -(-len(lasting) // LOOKED_UP) or 1]
     with ThreadPoolExecutor(len(clients)) as pool:
         parts = [looked_up[i :: len(clients)] for i in range(len(clients))]
-        found = sum(pool.map(_count_found, clients, parts))
+        actual = sum(pool.map(_count_found, clients, parts))
     gone = set(expected) - set(stored)
     aged = {
         str(name)
@@ -123,7 +123,7 @@ def check(
         and at - expected[name].begun >= aging.get(expected[name].map_name, math.inf)
     }  # fmt: skip
     result = AuditCounts(
-        len(expected), len(indexed), stated, len(aged), len(looked_up), found, gone - aged,
+        len(expected), len(indexed), stated, len(aged), len(looked_up), actual, gone - aged,
         returned=len(stored.keys() & ledger.deleted.keys()),
         stuck=len(present) - len(indexed) - stated,
         doubled=sum(contents.values()) - len(contents),

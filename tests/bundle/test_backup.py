@@ -137,14 +137,14 @@ def test_parts_of_another_version_or_of_a_damaged_bundle_are_read_again(
 ):
     folder = tmp_path / "place"
     for change in ("version", "damage"):
-        taken = take_backup(settings(data), str(folder))
-        path = folder / "bundles" / f"{taken.manifest.name}.json"
+        backup = take_backup(settings(data), str(folder))
+        path = folder / "bundles" / f"{backup.manifest.name}.json"
         of_first = {
-            "digest": taken.manifest.parts[0].digest,
-            "bytes": taken.manifest.parts[0].bytes,
+            "digest": backup.manifest.parts[0].digest,
+            "bytes": backup.manifest.parts[0].bytes,
         }
-        parts = tuple(part.model_copy(update=of_first) for part in taken.manifest.parts)
-        wrong = taken.manifest.model_copy(update={"parts": parts})
+        parts = tuple(part.model_copy(update=of_first) for part in backup.manifest.parts)
+        wrong = backup.manifest.model_copy(update={"parts": parts})
         if change == "version":
             wrong = wrong.model_copy(update={"sceneprint": "0.0.1"})
         BundlePlace.open(str(folder)).publish(wrong)
@@ -230,9 +230,9 @@ def test_it_is_in_nobodys_way(data, tmp_path, settings):
     with closing(sqlite3.connect(data / "sceneprint.db", isolation_level=None)) as writer:
         writer.execute("BEGIN IMMEDIATE")
         writer.execute("UPDATE maps SET title = 'half done'")
-        taken = take_backup(settings(data), str(tmp_path / "place"))
+        backup = take_backup(settings(data), str(tmp_path / "place"))
         writer.execute("COMMIT")
-    assert taken.lost == ()
+    assert backup.lost == ()
     restore_to_folder(str(tmp_path / "place"), tmp_path / "new")
     with closing(sqlite3.connect(tmp_path / "new" / "sceneprint.db")) as new:
         assert new.execute("SELECT title FROM maps").fetchall() == [(None,)]
@@ -361,10 +361,10 @@ def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):
             while frames:
                 engine.delete_frame("hall", frames.pop())
 
-        taken = take_backup(settings(data), str(tmp_path / "place"), delete)
+        backup = take_backup(settings(data), str(tmp_path / "place"), delete)
         assert frames == []
-        assert taken.lost == ()
-        assert taken.manifest.blobs == 9
+        assert backup.lost == ()
+        assert backup.manifest.blobs == 9
         assert set(engine.store.blobs.digests()) == before
         assert verify_bundle(str(tmp_path / "place")).lost == ()
         assert rows(data, "SELECT DISTINCT state FROM frames") == [("deleted",)]
@@ -384,7 +384,7 @@ def test_a_sweep_under_way_is_waited_for(data, tmp_path, settings):
             assert list((tmp_path / "place").glob("parts/??")) == []
             assert not taking.done()
             engine.delete_frame("hall", frame)
-        taken = taking.result()
-    assert taken.lost == ()
-    assert taken.manifest.frames == {"deleted": 2, "indexed": 3, "received": 1}
-    assert taken.manifest.blobs == 7
+        backup = taking.result()
+    assert backup.lost == ()
+    assert backup.manifest.frames == {"deleted": 2, "indexed": 3, "received": 1}
+    assert backup.manifest.blobs == 7

@@ -261,8 +261,8 @@ def test_no_number_is_given_out_twice(data, postgres_url, tmp_path, rows, settin
     assert ask(postgres_url, statement.format("events")) == [(highest + 1,)]
     assert ask(postgres_url, statement.format("samples")) == [(1,)]  # none was ever given out
     restore_to_folder(str(tmp_path / "place"), tmp_path / "home")
-    given = rows(tmp_path / "home", "SELECT seq FROM sqlite_sequence WHERE name = 'events'")
-    assert given == [(highest,)]
+    values = rows(tmp_path / "home", "SELECT seq FROM sqlite_sequence WHERE name = 'events'")
+    assert values == [(highest,)]
 
 
 @own_servers

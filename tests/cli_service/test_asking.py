@@ -18,14 +18,14 @@ from sceneprint_client.api import FrameMeta
 @pytest.fixture(scope="module")
 def maps(service_url, whole_rooms):
     """`near` has two views of the first room, `far` one of each."""
-    found = {}
+    results = {}
     frames = [frame for sequence in find_sequences(whole_rooms) for frame in sequence.frames]
     with Client(service_url) as client:
         for name, which in (("near", (0, 1)), ("far", (0, 3))):
             client.create_map(name, model="depth")
             added = [client.upload(name, frames[i], wait_s=PATIENCE_S) for i in which]
-            found[name] = [one.frame_id for one in added]
-    return found
+            results[name] = [one.frame_id for one in added]
+    return results
 
 
 def test_a_query_says_where_frames_were_lost(sceneprint, maps, whole_rooms):
@@ -102,8 +102,8 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(sceneprint, sides):
     # the true place turned about the cube by 0, 90, 180 and 270 degrees
     true = complex(truth[0][3], truth[1][3])
     turned = sorted((true * 1j**i for i in range(4)), key=lambda z: (z.real, z.imag))
-    found = sorted(places, key=lambda z: (z.real, z.imag))
-    assert np.abs(np.subtract(turned, found)).max() < 0.1
+    result = sorted(places, key=lambda z: (z.real, z.imag))
+    assert np.abs(np.subtract(turned, result)).max() < 0.1
 
 
 def floored(confidence):
@@ -168,20 +168,20 @@ def test_queries_that_came_are_listed(sceneprint, service_url, whole_rooms):
     sceneprint("upload", "asked", frames[0])
     assert sceneprint("queries", "asked").stdout == "no queries match\n"
     with Client(service_url) as client:
-        found = client.localize("asked", frames[0], robot="spot\u2028")
+        answer = client.localize("asked", frames[0], robot="spot\u2028")
         lost = client.localize("asked", frames[1], robot="cart")
     head, second, first = sceneprint("queries", "asked").stdout.splitlines()
     assert " ".join(head.split()) == "query time status ms map robot/session pose or reason"
-    t = found.pose.translation
-    place = f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in room-0, 1 view, {floored(found.confidence)} %"
+    t = answer.pose.translation
+    place = f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in room-0, 1 view, {floored(answer.confidence)} %"
     assert re.fullmatch(
-        rf"{found.query_id}  \S+ \S+  found +\d+  asked  spot\S*/seq-01  {place}", first
+        rf"{answer.query_id}  \S+ \S+  found +\d+  asked  spot\S*/seq-01  {place}", first
     ), first
     assert second.startswith(lost.query_id)
     assert second.endswith(f"  cart/seq-01  {lost.reason}")
     chosen = ("--status", "found", "--status", "failed", "--json")
     record = json.loads(sceneprint("queries", "asked", *chosen).stdout)
-    assert (record["query_id"], record["robot"]) == (found.query_id, "spot\u2028")
+    assert (record["query_id"], record["robot"]) == (answer.query_id, "spot\u2028")
     assert sceneprint("queries", "asked", "--until", record["at"], "--json").stdout == ""
 
 

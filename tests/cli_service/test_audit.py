@@ -24,21 +24,21 @@ def test_the_newest_entries_are_printed(sceneprint, data):
         "command  tenant.created fleet", "command  key.revoked robot",
         "command  key.created screen", "command  key.created robot",
     ]  # fmt: skip
-    for given, wanted in (
+    for options, wanted in (
         (("--limit", "1"), lines[:1]), (("--action", "key.c"), lines[2:]),
         (("--actor", "robot"), []), (("--map", "yard"), []), (("--since", "1h"), lines),
     ):  # fmt: skip
-        assert sceneprint("audit", *given, "--data", data).stdout.splitlines() == wanted
+        assert sceneprint("audit", *options, "--data", data).stdout.splitlines() == wanted
 
 
 def test_all_entries_are_exported(sceneprint, data):
     export = ("audit", "--data", data, "--format")
     lines = sceneprint(*export, "jsonl").stdout.splitlines()
-    found = [json.loads(line) for line in lines]
-    assert [(one["number"], one["action"]) for one in found] == [
+    body = [json.loads(line) for line in lines]
+    assert [(one["number"], one["action"]) for one in body] == [
         (1, "key.created"), (2, "key.created"), (3, "key.revoked"), (4, "tenant.created"),
     ]  # fmt: skip
-    assert found[0]["data"] == {
+    assert body[0]["data"] == {
         "name": "robot", "grants": {"*": "admin"}, "tenant": "robot", "expires_at": None
     }  # fmt: skip
     file = data / "audit.log"

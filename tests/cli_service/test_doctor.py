@@ -151,16 +151,16 @@ def waiting(tmp_path_factory, rooms):
 def test_workers_that_are_missing(waiting):
     stats = waiting.stats(minutes=1)
     assert (stats.workers, stats.waiting) == ([], 1)
-    found = worker_check(stats, read_only=False)
-    assert found.verdict == "note"
-    assert "wait if the service has just started" in found.text
+    result = worker_check(stats, read_only=False)
+    assert result.verdict == "note"
+    assert "wait if the service has just started" in result.text
     assert re.fullmatch(r"1 job waiting, 0 running, the oldest for \d+ s", queue_check(stats).text)
     late = stats.model_copy(
         update={"oldest_waiting_s": {"sign": 100.0}, "jobs": {"queued": 1, "dead": 2}}
     )
-    found = worker_check(late, read_only=False)
-    assert found.verdict == "WRONG"
-    assert "not signed. Start workers with `sceneprint work`, and read their log" in found.text
+    result = worker_check(late, read_only=False)
+    assert result.verdict == "WRONG"
+    assert "not signed. Start workers with `sceneprint work`, and read their log" in result.text
     assert worker_check(late, read_only=True).verdict == "ok"  # there is nothing for them to do
     queue = queue_check(late)
     assert queue.verdict == "note"
@@ -181,5 +181,5 @@ def test_object_stores(bucket, tmp_path, monkeypatch):
     assert "AWS_... in the environment" in blobs.text
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
     lost = Settings(data_dir=tmp_path, database_url=None, index_url=f"{bucket}-none")
-    [found] = object_stores(lost)
-    assert (found.verdict, found.subject) == ("WRONG", "indexes")
+    [result] = object_stores(lost)
+    assert (result.verdict, result.subject) == ("WRONG", "indexes")

@@ -11,11 +11,11 @@ def test_options_are_a_filter():
     parser = argparse.ArgumentParser()
     add_filter_options(parser)
     assert filter_of(parser.parse_args([])) is None
-    given = (
+    values = (
         "--session s --after 2026-11-16T09:30:00Z --before 2026-11-16T10:30:00Z --not-within 4.5 "
         "--region 0,1,2,3,4.5,5 --region-frame hall --exclude f --exclude g"
     )
-    assert filter_of(parser.parse_args(given.split())) == {
+    assert filter_of(parser.parse_args(values.split())) == {
         "session": ["s"], "captured_after": "2026-11-16T09:30:00Z",
         "captured_before": "2026-11-16T10:30:00Z", "not_within_s": 4.5,
         "region": {"parent_frame": "hall", "min": {"x": 0, "y": 1, "z": 2},

@@ -34,15 +34,15 @@ def test_keys_are_made_listed_and_revoked(keys, tmp_path):
     again = keys("--revoke", "robot 1", expect=2)
     assert again.stderr.startswith("sceneprint keys: There is no key named 'robot 1'")
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
-        found = [engine.find_key(secret) for secret in secrets]
-    assert [one and (one.name, one.grants) for one in found] == [None, ("robot 2", {"*": "admin"})]
+        rows = [engine.find_key(secret) for secret in secrets]
+    assert [one and (one.name, one.grants) for one in rows] == [None, ("robot 2", {"*": "admin"})]
 
 
 def test_a_key_gets_a_new_secret_while_the_old_one_works(keys, tmp_path):
     def named(secret):
         with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
-            found = engine.find_key(secret)
-            return None if found is None else found.name
+            key = engine.find_key(secret)
+            return None if key is None else key.name
 
     old = keys("--create", "robot", "--scope", "read", "--expires", "3d").stdout.strip()
     done = keys("--rotate", "robot", "--overlap", "2h")

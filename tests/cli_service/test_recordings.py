@@ -88,9 +88,9 @@ def test_each_bag_of_a_folder_is_a_session(sceneprint, bags, service_url):
     assert f"{bags}/first.mcap: 2 of 2 frames of /camera" in done.stderr
     assert f"{bags}/day2/second: 3 of 3 frames of /camera" in done.stderr
     with Client(service_url) as client:
-        found = sorted((frame.session, frame.pose.parent_frame) for frame in client.frames("days")
+        frames = sorted((frame.session, frame.pose.parent_frame) for frame in client.frames("days")
                        if frame.pose is not None)  # fmt: skip
-    assert found == [("day2/second", "day2/second/odom")] * 3 + [("first", "first/odom")] * 2
+    assert frames == [("day2/second", "day2/second/odom")] * 3 + [("first", "first/odom")] * 2
     done = sceneprint("query", "days", bags, *options, "--frame", 4, "--json")
     assert json.loads(done.stdout)["name"] == "day2/second/000002"
     done = sceneprint("localize", "days", bags, *options, "--frame", 0)
@@ -138,7 +138,7 @@ def test_a_bag_of_which_nothing_would_be_taken(sceneprint, tmp_path, ros):
 
 
 def test_options_that_are_none(recording, capsys):
-    for given in ("-1", "nan", "x"):
+    for text in ("-1", "nan", "x"):
         with pytest.raises(SystemExit):
-            main(["bag", str(recording), "--keyframe-m", given])
+            main(["bag", str(recording), "--keyframe-m", text])
         assert "is not a number of at least 0" in capsys.readouterr().err

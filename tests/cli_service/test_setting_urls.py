@@ -43,11 +43,11 @@ def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch):
         ("INDEX_URL", "file:///srv/indexes"),
     ):  # fmt: skip
         monkeypatch.setenv(f"SCENEPRINT_{name}", value)
-    found = settings_of(argparse.Namespace())
-    assert found.database == SERVER
-    assert found.blob_url.get_secret_value() == "s3://bucket/prefix"
-    assert found.index_url == "file:///srv/indexes"
-    assert "hunter2" not in repr(found)
+    settings = settings_of(argparse.Namespace())
+    assert settings.database == SERVER
+    assert settings.blob_url.get_secret_value() == "s3://bucket/prefix"
+    assert settings.index_url == "file:///srv/indexes"
+    assert "hunter2" not in repr(settings)
 
 
 def test_bodies_may_be_as_large_as_a_decoder_takes(monkeypatch):

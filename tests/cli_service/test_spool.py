@@ -47,9 +47,9 @@ def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_pat
         assert counts == "6 frames uploaded; 1 refused, 0 wait"
         assert summary.startswith("poses of 6 of 7 frames; depth ")
         assert said.stderr.startswith("broken.ply: ")
-        found = list(client.frames("spooled"))
-    assert [one.robot for one in found] == ["cart"] * 6
-    assert {one.pose.parent_frame for one in found if one.pose} == {"cart/room-0", "cart/room-1"}
+        frames = list(client.frames("spooled"))
+    assert [one.robot for one in frames] == ["cart"] * 6
+    assert {one.pose.parent_frame for one in frames if one.pose} == {"cart/room-0", "cart/room-1"}
     lines = sceneprint("spool", spool).stdout.splitlines()
     assert lines[0] == "0 frames wait; 0.0 of 100.0 MB"
     assert lines[1] == "6 uploaded, 1 refused, 0 thinned, 0 refused and discarded"
@@ -63,8 +63,8 @@ def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_pat
 @pytest.fixture
 def example(rooms, tmp_path, monkeypatch, capsys):
     def run(url, *more):
-        given = [rooms, "offline-example", "--spool", tmp_path / "spool", "--url", url, *more]
-        monkeypatch.setattr(sys, "argv", ["offline_robot.py", *map(str, given)])
+        arguments = [rooms, "offline-example", "--spool", tmp_path / "spool", "--url", url, *more]
+        monkeypatch.setattr(sys, "argv", ["offline_robot.py", *map(str, arguments)])
         capsys.readouterr()
         runpy.run_path(str(ROOT / "examples" / "offline_robot.py"), run_name="__main__")
         return capsys.readouterr().out.splitlines()

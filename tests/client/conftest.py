@@ -31,12 +31,12 @@ def answer(status, at=0.0, parent="map", **fields):
         "translation": dict(zip("xyz", matrix[:3, 3], strict=True)),
         "rotation": dict(zip("xyzw", quaternion_of(matrix[:3, :3]), strict=True)),
     }  # fmt: skip
-    found = status == "found"
+    located = status == "found"
     record = {
         "status": status, "reason": f"{status}, told by a test", "map": "m",
-        "pose": pose if found else None, "support": 3 * found, "votes": 3 * found,
-        "spread_m": None, "spread_deg": None, "strength": "strong" if found else None,
-        "verified_by": "matches" if found else None,
+        "pose": pose if located else None, "support": 3 * located, "votes": 3 * located,
+        "spread_m": None, "spread_deg": None, "strength": "strong" if located else None,
+        "verified_by": "matches" if located else None,
         "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
         "milliseconds": {},
         "alternatives": [{"pose": pose, "confidence": 0.5, "support": 1}]
@@ -88,7 +88,7 @@ def walk(room_views, tmp_path_factory):
     path = tmp_path_factory.mktemp("walk") / "depth.png"
 
     def make(count=4, sessions="a", parent=None, **options):
-        found = []
+        results = []
         frames = map(halved, room_views(21, 0, count, along_path=True, **options).frames)
         for i, frame in enumerate(frames):
             write_depth_png(path, frame.depth, 1000.0)
@@ -101,8 +101,8 @@ def walk(room_views, tmp_path_factory):
                 "pose": {name: value for name, value in pose.items() if value is not None},
                 "captured_at": datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=i),
             }  # fmt: skip
-            found.append((path.read_bytes(), FrameMeta.model_validate(fields)))
-        return found
+            results.append((path.read_bytes(), FrameMeta.model_validate(fields)))
+        return results
 
     return make
 

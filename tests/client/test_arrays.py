@@ -86,10 +86,10 @@ def test_what_is_no_frame_is_refused(references):
         sendable(wrong, CAMERA, with_pose=False)
     with pytest.raises(TypeError, match="lacks the image size"):
         sendable(references[0].path, (5, 6, 1.5, 1), with_pose=False)
-    known = {"robot": "a"}
+    fields = {"robot": "a"}
     for frame in (references[0].path, references[0], b"P5"):
         with pytest.raises(TypeError) as caught:
-            sendable(frame, known, with_pose=False)
+            sendable(frame, fields, with_pose=False)
         assert str(caught.value) == "pass a FrameMeta or CameraIntrinsics as meta, not dict"
 
 
@@ -142,8 +142,8 @@ def test_poses_as_ros_names_them():
             "orientation": {"x": 0, "y": 0, "z": QUARTER, "w": QUARTER}}  # fmt: skip
     pose = GivenPose.model_validate({**record, "parent_frame": "map"})
     assert (pose.translation.y, pose.rotation.w) == (2, QUARTER)
-    given = pose.model_dump(exclude_defaults=True)
-    assert set(given) == {"translation", "rotation", "parent_frame"}
+    fields = pose.model_dump(exclude_defaults=True)
+    assert set(fields) == {"translation", "rotation", "parent_frame"}
     for twice in ({**record, "translation": record["position"]}, {"position": record["position"]}):
         with pytest.raises(InvalidRequest):
             checked(GivenPose, "The pose", **twice)

@@ -35,12 +35,12 @@ def associated(service_url, walk):
 
 def test_edges_and_graphs(associated):
     client = associated.client
-    found = client.compute(Association, MAP, sessions=["a", "b"], k=2, seed=3)
-    assert found.state is JobState.SUCCEEDED
-    name = found.job_id
+    result = client.compute(Association, MAP, sessions=["a", "b"], k=2, seed=3)
+    assert result.state is JobState.SUCCEEDED
+    name = result.job_id
     edges = list(client.edges(MAP, name))
-    assert found.result.edges == len(edges) > 4
-    assert found.result.joins[0].transform is not None
+    assert result.result.edges == len(edges) > 4
+    assert result.result.joins[0].transform is not None
     assert {edge.from_frame for edge in edges} <= associated.numbers.keys()
     middle = sorted(edge.overlap for edge in edges)[len(edges) // 2]
     strongest = json.loads(client.graph(MAP, name, "json", min_overlap=middle))

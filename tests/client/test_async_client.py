@@ -16,8 +16,8 @@ BUSY = (503, {}, {"type": "/problems/busy", "title": "", "status": 503, "detail"
 
 
 def public_methods(kind):
-    found = inspect.getmembers(kind, inspect.isfunction)
-    return {name: one for name, one in found if not name.startswith("_")}
+    result = inspect.getmembers(kind, inspect.isfunction)
+    return {name: one for name, one in result if not name.startswith("_")}
 
 
 def test_both_clients_have_the_same_methods():

@@ -36,8 +36,8 @@ def test_a_frame_is_sent_with_its_name_and_a_query_without(references, tmp_path)
     meta, camera = meta_of(one), (5.0, 5.0, 2.0, 2.0)
     assert (meta.name, meta.sequence) == ("frame-000001.depth.png", 1)
 
-    def labels(frame, known=None, *, with_pose=True):
-        sent = sendable(frame, known, with_pose=with_pose)[1]
+    def labels(frame, meta=None, *, with_pose=True):
+        sent = sendable(frame, meta, with_pose=with_pose)[1]
         return sent.name, sent.sequence
 
     for frame in (one, path, str(path)):

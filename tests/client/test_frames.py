@@ -35,8 +35,8 @@ def test_a_path_is_sent_with_the_camera_beside_it(references, tmp_path):
     assert data == references[2].path.read_bytes()
     np.testing.assert_array_equal(meta.pose.matrix, references[2].pose)
     assert meta.intrinsics == meta_of(references[2]).intrinsics
-    given = meta.model_copy(update={"depth_scale": 5000.0})
-    assert sendable(references[2].path, given, with_pose=True) == (data, given)
+    own_meta = meta.model_copy(update={"depth_scale": 5000.0})
+    assert sendable(references[2].path, own_meta, with_pose=True) == (data, own_meta)
     bare = tmp_path / "frame.png"
     shutil.copy(references[2].path, bare)
     with pytest.raises(errors.DatasetError, match=r"intrinsics\.json"):

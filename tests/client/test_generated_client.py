@@ -19,8 +19,8 @@ def test_a_generated_client_maps_and_localizes(
 ):
     pytest.importorskip("openapi_python_client")
     document, options = tmp_path / "openapi.json", tmp_path / "options.yaml"
-    found = httpx.get(f"{service_url}/openapi.json", timeout=PATIENCE_S)
-    document.write_text(found.text)
+    response = httpx.get(f"{service_url}/openapi.json", timeout=PATIENCE_S)
+    document.write_text(response.text)
     options.write_text("post_hooks: []")
     command = [sys.executable, "-m", "openapi_python_client", "generate", "--meta", "none"]
     subprocess.run(
@@ -55,8 +55,8 @@ def test_a_generated_client_maps_and_localizes(
         assert [frame.frame_id for frame in page.items] == [added.frame_id]
         assert page.items[0].captured_at is None
         body = models.LocalizeFilesBody(**form(), k=1)
-        found = api["queries.localize"].sync(map_name, client=client, body=body)
-        assert found.matches == [added.frame_id]
+        response = api["queries.localize"].sync(map_name, client=client, body=body)
+        assert response.matches == [added.frame_id]
         named = models.AskJsonBody(added.frame_id)
         assert api["queries.ask"].sync(map_name, client=client, body=named).counts.map_ == 0
         problem = api["maps.get_map"].sync("nowhere", client=client)

@@ -52,12 +52,12 @@ def test_scans_of_the_last_metres_are_joined_and_thinned():
     for i in range(5):  # one wall, seen from every metre
         assert joiner.add(i * SECOND, np.array([[10.0 - i, 0.05, 0.05], [10.0 - i, i + 0.5, 0.05]]))
     assert len(joiner) == 3  # at 2, 3 and 4 m
-    found = joiner.cloud()
+    result = joiner.cloud()
     # the newest scan comes first, and one point remains of those in the common voxel
     expected = [[6, 0.05, 0.05], [6, 4.5, 0.05], [6, 3.5, 0.05], [6, 2.5, 0.05]]
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(result, expected, atol=1e-5)
     assert joiner.counts == {"scans": 5, "without_odometry": 0, "untimed": 5, "restarts": 0}
-    assert found.dtype == np.float32
+    assert result.dtype == np.float32
 
 
 def test_windows_end_at_a_length_or_a_number():

@@ -49,9 +49,9 @@ def test_no_call_gets_by_without_a_key(remote, references, tmp_path):
             needed = {"map_name": "hall", "frame_id": ID}
 
         def call(name=name, needed=needed):
-            found = getattr(remote, name)(**needed)
-            if isinstance(found, Iterator):
-                next(found)
+            result = getattr(remote, name)(**needed)
+            if isinstance(result, Iterator):
+                next(result)
 
         with pytest.raises(KeyRequired):
             call()
@@ -66,8 +66,8 @@ def test_keys_are_made_listed_rotated_and_revoked(embedded):
     key = embedded.create_key("cart 9", {"hall": "write", "yard": "read"}, until)
     assert (key.name, key.grants) == ("cart 9", {"hall": "write", "yard": "read"})
     assert key.expires_at == until
-    found = embedded.keys()
-    (listed,) = [key for key in found if key.name == "cart 9"]
+    keys = embedded.keys()
+    (listed,) = [key for key in keys if key.name == "cart 9"]
     assert listed.model_dump() == key.model_dump(exclude={"secret"})
     with pytest.raises(Conflict, match="A key named 'cart 9' already exists"):
         embedded.create_key("cart 9", {"*": "read"})
@@ -77,8 +77,8 @@ def test_keys_are_made_listed_rotated_and_revoked(embedded):
     assert (turned.secret != key.secret, turned.grants) == (True, key.grants)
     assert turned.previous_until - datetime.now(UTC) <= timedelta(seconds=60)
     embedded.revoke_key("cart 9")
-    found = embedded.keys()
-    assert "cart 9" not in [key.name for key in found]
+    keys = embedded.keys()
+    assert "cart 9" not in [key.name for key in keys]
     with pytest.raises(UnknownKey, match="'cart 9'"):
         embedded.revoke_key("cart 9")
     embedded.create_map("yard", model="depth")

@@ -20,18 +20,18 @@ def test_events_that_are_kept(client, map_name, references):
     client.create_map(map_name, model="depth")
     added = client.upload(map_name, references[0], wait_s=PATIENCE_S)
     client.delete_frame(map_name, added.frame_id)
-    found = list(client.events(map_name, follow=False))
-    assert [(one.kind, one.frame_id) for one in found] == [
+    events = list(client.events(map_name, follow=False))
+    assert [(one.kind, one.frame_id) for one in events] == [
         ("map.created", None),
         ("frame.received", added.frame_id),
         ("frame.indexed", added.frame_id),
         ("frame.deleted", added.frame_id),
     ]
     page = client.event_page(map_name, kinds=["frame."], limit=2)
-    assert page.items == found[:1:-1]
+    assert page.items == events[:1:-1]
     rest = client.event_page(map_name, kinds=["frame."], limit=2, cursor=page.next_cursor)
-    assert (rest.items, rest.next_cursor) == (found[1:2], None)
-    assert list(client.events(map_name, after=found[2].id, follow=False)) == found[3:]
+    assert (rest.items, rest.next_cursor) == (events[1:2], None)
+    assert list(client.events(map_name, after=events[2].id, follow=False)) == events[3:]
     for follow in (False, True):
         with pytest.raises(InvalidRequest, match="Start again"):
             next(client.events(after="none", follow=follow))
@@ -69,8 +69,8 @@ def test_a_stream_is_read_as_the_standard_says():
         f"data: {data[:half]}", f"data:{data[half:]}", "", "id: 9", "data: {",
     ]  # fmt: skip
     place = StreamPosition(None)
-    found = [(one, place.last) for line in lines if (one := place.read(line)) is not None]
-    assert found == [(EVENT, "7")]
+    result = [(one, place.last) for line in lines if (one := place.read(line)) is not None]
+    assert result == [(EVENT, "7")]
     # the position is still before the incomplete event
     assert place == StreamPosition("7", 0.02)
 

@@ -21,14 +21,14 @@ def ids(client, references):
     """Three frames of a map, taken a second apart."""
     map_name = "outputs"
     client.create_map(map_name, model="depth")
-    found = []
+    results = []
     for i, reference in enumerate(references[:3]):
         meta = meta_of(reference, robot="r2", tags=["door"] if i else [])
         meta = meta.model_copy(update={"captured_at": START + timedelta(seconds=i)})
-        found.append(
+        results.append(
             client.upload(map_name, reference.path.read_bytes(), meta, wait_s=PATIENCE_S).frame_id
         )
-    return found
+    return results
 
 
 def listed(client, map_name, **wanted):

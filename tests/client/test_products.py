@@ -74,10 +74,10 @@ def test_the_cells_of_a_difference_are_sent(client):
     result = job.result
     assert result.same > 500
     assert (result.parent_frame, result.frames_before, result.frames_after) == ("room", 2, 2)
-    found = client.difference_points(MAP, job.job_id)
-    assert found.patches is not None
-    assert (found.patches == SAME).sum() == result.same
-    assert (np.diff(found.patches) >= 0).all()
+    actual = client.difference_points(MAP, job.job_id)
+    assert actual.patches is not None
+    assert (actual.patches == SAME).sum() == result.same
+    assert (np.diff(actual.patches) >= 0).all()
 
 
 def test_frames_and_changes_of_coverage(client):

@@ -24,18 +24,18 @@ def test_all_ways_of_asking(client, map_name, references):
     assert several.maps == [map_name, other]
     stored = client.query(map_name, frame_id=ids[1], maps=f"{other},{map_name}")
     assert (stored.matches[0].map, stored.matches[0].distance) == (other, 0)
-    found = client.localize(map_name, references[0], seed=2, robot="spot")
-    assert (found.pose.parent_frame, found.seed) == ("room-0/seq-01", 2)
+    answer = client.localize(map_name, references[0], seed=2, robot="spot")
+    assert (answer.pose.parent_frame, answer.seed) == ("room-0/seq-01", 2)
     named = client.similarity((map_name, ids[0]), (other, added), seed=1)
     sent = client.similarity(NamedFrame(map=other, frame_id=added), references[0])
     assert sent.distance == named.distance > 0
     bare = client.similarity(references[0], references[1], validate=False, model="depth")
     assert bare.validation is None
     # each query left a record, the newest first; the comparisons left none
-    assert next(client.queries(map_name)).query_id == found.query_id
+    assert next(client.queries(map_name)).query_id == answer.query_id
     assert next(client.queries(other)).query_id == stored.query_id  # where its match is
     (spot,) = client.queries(map_name, robot="spot", status=["found", "failed"])
-    assert (spot.query_id, spot.session, spot.key) == (found.query_id, "room-0/seq-01", None)
+    assert (spot.query_id, spot.session, spot.key) == (answer.query_id, "room-0/seq-01", None)
     assert list(client.queries(map_name, robot="spot", until=spot.at)) == []
     client.delete_queries(map_name)
     assert list(client.queries(map_name)) == []

@@ -157,9 +157,9 @@ def test_files_are_sent_in_ranges(client, answered):
     whole = client.reconstruction_mesh(job.job_id)
     url = f"/v1/reconstructions/{job.job_id}/mesh.ply"
     http = client._http
-    given = http.get(url)
-    tag = given.headers["ETag"]
-    assert (given.content, given.headers["Content-Type"]) == (whole, "application/ply")
+    response = http.get(url)
+    tag = response.headers["ETag"]
+    assert (response.content, response.headers["Content-Type"]) == (whole, "application/ply")
     for span, expected in (("0-99", whole[:100]), ("100-", whole[100:]), ("-7", whole[-7:])):
         part = http.get(url, headers={"Range": f"bytes={span}", "If-Range": tag})
         assert (part.status_code, part.content) == (206, expected)

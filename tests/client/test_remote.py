@@ -153,9 +153,9 @@ def test_addresses_that_are_none(url):
 
 @pytest.mark.usefixtures("hasty")
 def test_nobody_there():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        url = f"http://127.0.0.1:{taken.getsockname()[1]}"
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
         with Client(url) as client:
             assert not client.healthy()
             with pytest.raises(errors.Unreachable, match="sceneprint serve") as raised:

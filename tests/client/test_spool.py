@@ -56,14 +56,14 @@ def depth(number):
     return image
 
 
-def large(number, known):
+def large(number, fields):
     lens = CAMERA.model_copy(update={"width": 64, "height": 48})
-    return np.tile(depth(number), (4, 4)), known.model_copy(update={"intrinsics": lens})
+    return np.tile(depth(number), (4, 4)), fields.model_copy(update={"intrinsics": lens})
 
 
-def broken(number, known):
+def broken(number, fields):
     """None, of 150 kB, which a service refuses."""
-    return f"none, {number}".encode().ljust(150_000), known
+    return f"none, {number}".encode().ljust(150_000), fields
 
 
 def names(path):
@@ -99,13 +99,13 @@ def test_a_metre_thirty_degrees_and_a_minute_weigh_the_same():
 
 def test_a_full_spool_gives_up_the_frame_nearest_to_its_neighbours(tmp_path):
     """Sums of the distances to the frames before and after, by hand."""
-    path, kept = tmp_path / "spool", []
+    path, contents = tmp_path / "spool", []
     with Spool(path, 5 * CHARGE) as spool:
         for number, x in enumerate((0, 1, 1.25, 3, 5, 7, 7.1, 9)):
             assert spool.add(depth(number), meta(x, name=f"{x:g}"))
-            kept.append(" ".join(names(path)))
+            contents.append(" ".join(names(path)))
         now = spool.status()
-    assert kept[4:] == [
+    assert contents[4:] == [
         "0 1 1.25 3 5",
         "0 1.25 3 5 7",  # 1: 1 + 0.25; 1.25: 0.25 + 1.75; 3: 1.75 + 2
         "0 3 5 7 7.1",  # 1.25: 1.25 + 1.75; 3: 1.75 + 2; 5: 2 + 2
@@ -115,23 +115,23 @@ def test_a_full_spool_gives_up_the_frame_nearest_to_its_neighbours(tmp_path):
 
 
 def test_without_poses_time_alone_decides_and_the_oldest_of_equals_goes(tmp_path):
-    path, kept = tmp_path / "spool", []
+    path, contents = tmp_path / "spool", []
     with Spool(path, 5 * CHARGE) as spool:
         for minute in range(7):
             spool.add(depth(minute), meta(seconds=60 * minute, name=f"{minute}"))
-            kept.append(" ".join(names(path)))
-    assert kept[5:] == ["0 2 3 4 5", "0 2 4 5 6"]  # all 2; then 2: 2 + 1, 3 and 4: 1 + 1
+            contents.append(" ".join(names(path)))
+    assert contents[5:] == ["0 2 3 4 5", "0 2 4 5 6"]  # all 2; then 2: 2 + 1, 3 and 4: 1 + 1
 
 
 def test_runs_are_thinned_apart_and_their_ends_stay(tmp_path):
     """Where only ends are left, the oldest goes."""
-    path, kept = tmp_path / "spool", []
+    path, contents = tmp_path / "spool", []
     drives = (("a", 0), ("b", 0), ("a", 9), ("b", 0.1), ("a", 9.5), ("a", 20), ("b", 5), ("b", 6))
     with Spool(path, 5 * CHARGE) as spool:
         for number, (session, x) in enumerate(drives):
             spool.add(depth(number), meta(x, session=session, name=f"{session}{x:g}"))
-            kept.append(" ".join(names(path)))
-    assert kept[5:] == [
+            contents.append(" ".join(names(path)))
+    assert contents[5:] == [
         "a0 b0 b0.1 a9.5 a20",  # a9: 9 + 0.5, and no other lies between two
         "a0 b0 b0.1 a20 b5",
         "a0 b0 a20 b5 b6",
@@ -203,10 +203,10 @@ def test_a_full_disk_leaves_the_spool_as_it_was(tmp_path):
         with longest_file(path.stat().st_size + 10 * CHARGE):
             with pytest.raises(UnusableStore, match=r"spool: .*nothing was changed"):
                 fill(spool, large)
-            taken = spool.status().waiting
-        assert 200 <= taken <= 600  # also what was reserved for the journal is used for frames
-        assert spool.add(depth(taken), meta(name=f"{taken}"))
-    assert names(path) == [str(number) for number in range(taken + 1)]
+            count = spool.status().waiting
+        assert 200 <= count <= 600  # also what was reserved for the journal is used for frames
+        assert spool.add(depth(count), meta(name=f"{count}"))
+    assert names(path) == [str(number) for number in range(count + 1)]
     with closing(sqlite3.connect(path)) as database, database:
         assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
 
@@ -217,12 +217,12 @@ def test_a_full_disk_does_not_stop_uploads(remote, map_name, tmp_path):
     with Spool(path) as spool, longest_file(path.stat().st_size + 10 * CHARGE):
         with pytest.raises(UnusableStore):
             fill(spool, broken)
-        taken = spool.status().waiting
-        assert taken > 5
+        count = spool.status().waiting
+        assert count > 5
         report = spool.sync(remote, map_name)
-        assert (report.received, report.refused, spool.status().waiting) == (0, taken, 0)
+        assert (report.received, report.refused, spool.status().waiting) == (0, count, 0)
         explained = [refusal for refusal in spool.refusals() if "none of" in refusal.reason]
-        assert taken / 2 < len(explained) <= taken  # the disk has no room for all reasons
+        assert count / 2 < len(explained) <= count  # the disk has no room for all reasons
 
 
 @pytest.mark.parametrize("refused", [False, True])
@@ -278,13 +278,13 @@ def test_what_waits_is_uploaded_and_refusals_are_set_aside(remote, map_name, ref
         now = spool.status()
         assert (now.waiting, now.refused, now.uploaded, now.thinned) == (0, 1, 4, 0)
         assert now.bytes == CHARGE
-        found = list(remote.frames(map_name))
-        assert found[0].frame_id == there.frame_id
-        assert [one.name for one in found[1:]] == [
+        frames = list(remote.frames(map_name))
+        assert frames[0].frame_id == there.frame_id
+        assert [one.name for one in frames[1:]] == [
             *(reference.path.name for reference in references[1:3]), "last",
         ]  # fmt: skip
-        assert found[-1].captured_at == START
-        assert found[-1].pose is not None
+        assert frames[-1].captured_at == START
+        assert frames[-1].pose is not None
         assert spool.retry_refused() == 1
         report = spool.sync(remote, map_name)
         assert (report.received, report.there, report.refused) == (0, 0, 1)
@@ -311,8 +311,8 @@ def test_a_request_that_is_too_large_is_halved(remote, map_name, tmp_path):
         for number, (name, side) in enumerate(sizes.items()):
             lens = CAMERA.model_copy(update=dict.fromkeys(("width", "height", "fx", "fy"), side))
             image = np.full((side, side), 2000 + number, np.uint16)
-            known = meta(number, name=name).model_copy(update={"intrinsics": lens})
-            spool.add(image, known)
+            fields = meta(number, name=name).model_copy(update={"intrinsics": lens})
+            spool.add(image, fields)
         report = spool.sync(remote, map_name)
         [refusal] = spool.refusals()
     assert (report.received, report.refused) == (3, 1)
@@ -452,7 +452,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path):
                             process.kill()
                     process.wait()
                 syncs += process.returncode == -signal.SIGKILL
-            found = [frame.name for frame in client.frames("hall")]
+            frames = [frame.name for frame in client.frames("hall")]
             contents = {frame.content_id for frame in client.frames("hall")}
     finally:
         os.killpg(service.pid, signal.SIGTERM)
@@ -460,7 +460,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path):
     with Spool(path) as spool:
         now = spool.status()
     sys.stdout.write(f"{count} frames: {kills} kills, {full} full disks, {syncs} kills of sync\n")
-    assert found == [str(number) for number in range(count)]  # 0 lost, 0 doubled, in order
+    assert frames == [str(number) for number in range(count)]  # 0 lost, 0 doubled, in order
     assert len(contents) == count
     assert (now.waiting, now.refused, now.thinned, now.uploaded) == (0, 0, 0, count)
     assert syncs >= 10
@@ -474,8 +474,8 @@ def test_a_full_spool_reports_what_it_gave_up_of_a_drive(tmp_path):
             spool.add(depth(number), drive_meta(number))
         now = spool.status()
     assert (now.waiting, now.thinned) == (50, 150)
-    kept = [int(name) for name in names(path)]
-    assert (kept[0], kept[-1]) == (0, 199)
+    contents = [int(name) for name in names(path)]
+    assert (contents[0], contents[-1]) == (0, 199)
     # even along the drive: no gap is more than twice the mean of 4 but for the ends
-    assert max(np.diff(kept)) <= 8
+    assert max(np.diff(contents)) <= 8
     assert path.stat().st_size <= most + (2 << 20) + 20 * 4096  # what was reserved for the journal

@@ -39,14 +39,14 @@ def test_tiles_and_the_frames_that_saw_them(fused):
         tiles = list(fused.surface_tiles(MAP, "room", level.level))
         assert (len(tiles), sum(tile.bytes for tile in tiles)) == (level.tiles, level.bytes)
         for tile in tiles:
-            found = decode_tile(fused.surface_tile(MAP, tile.digest), tile, level.tile_m)
+            result = decode_tile(fused.surface_tile(MAP, tile.digest), tile, level.tile_m)
             place = [tile.column, tile.row, tile.floor]
-            assert (np.floor(found.points / level.tile_m) == place).all()
-            sessions.update(found.sessions.tolist())
-            cells += len(found.points)
+            assert (np.floor(result.points / level.tile_m) == place).all()
+            sessions.update(result.sessions.tolist())
+            cells += len(result.points)
     assert cells == sum(level.cells for level in parent.levels)
     assert sessions == {0, 1}
-    spot = found.points[0].tolist()  # of the coarsest level: near what was seen
+    spot = result.points[0].tolist()  # of the coarsest level: near what was seen
     assert list(fused.surface_frames(MAP, spot, radius=1.0))
     every = [-100.0, -100.0, -100.0, 100.0, 100.0, 100.0]
     boxed = list(fused.surface_frames(MAP, box=every, parent="room"))

@@ -78,9 +78,9 @@ class Sent:
 
     def form(self, **fields):
         """Return the arguments of a request that sends the frame again, with only its camera."""
-        known = {"intrinsics": self.meta["intrinsics"]}
+        details = {"intrinsics": self.meta["intrinsics"]}
         parts = {"frame": ("frame.png", self.png, "image/png")}
-        return {"files": parts, "data": {"meta": json.dumps(known), **fields}}
+        return {"files": parts, "data": {"meta": json.dumps(details), **fields}}
 
 
 @dataclass
@@ -153,10 +153,10 @@ def serve():
 def chromium():
     """Path of an installed Chromium."""
     names = ("chromium", "chromium-browser", "google-chrome")
-    found = next(filter(None, map(shutil.which, names)), None)
-    if found is None:
+    result = next(filter(None, map(shutil.which, names)), None)
+    if result is None:
         pytest.skip(f"no Chromium is installed ({', '.join(names)})")
-    return found
+    return result
 
 
 @pytest.fixture(scope="session")
@@ -181,28 +181,30 @@ def station(
     between the runs ROOM/ann (even) and ROOM/bob (odd).
     """
     del chromium  # without a browser the test is skipped before the service starts
-    found = folder_stack.enter_context(running(tmp_path_factory.mktemp("station"), 2))
-    found.client.post("/v1/maps", json={"name": "building", "title": "Two rooms", "model": "depth"})
+    server = folder_stack.enter_context(running(tmp_path_factory.mktemp("station"), 2))
+    server.client.post(
+        "/v1/maps", json={"name": "building", "title": "Two rooms", "model": "depth"}
+    )
     metas, files = [], []
     for meta, png in _shots(tmp_path_factory.mktemp("shots"), room_views):
         metas.append(meta)
         files.append(("frame", (f"{len(files)}.png", png, "image/png")))
-    sent = found.client.post(
+    sent = server.client.post(
         "/v1/maps/building/frames/batch", data={"metas": json.dumps(metas)}, files=files
     )
     assert sent.status_code == 200, sent.text
-    found.frames = [
+    server.frames = [
         Sent(item["frame"]["frame_id"], file[1][1], meta)
         for item, file, meta in zip(sent.json()["items"], files, metas, strict=True)
     ]
     states = {}
 
     def signed():
-        states.update(found.client.get("/v1/maps/building").json()["frames"])
+        states.update(server.client.get("/v1/maps/building").json()["frames"])
         return states.get("indexed") == len(files)
 
     until(signed)
-    return found
+    return server
 
 
 @pytest.fixture(scope="session")
@@ -228,15 +230,15 @@ def _shots(folder, room_views):
     for room in range(ROOMS):
         for view, frame in enumerate(room_views(21, room, VIEWS, along_path=True).frames):
             write_depth_png(path, frame.depth, 1000.0)
-            lens, who = frame.intrinsics, "bob" if view % 2 else "ann"
+            lens, robot = frame.intrinsics, "bob" if view % 2 else "ann"
             assert frame.pose is not None
             yield (
                 {
                     "intrinsics": {
                         n: getattr(lens, n) for n in ("width", "height", "fx", "fy", "cx", "cy")
                     },
-                    "robot": who,
-                    "session": f"room-{room}/{who}",
+                    "robot": robot,
+                    "session": f"room-{room}/{robot}",
                     "captured_at": TAKEN.format(minute=room, second=view),
                     "pose": {"parent_frame": f"room-{room}", "matrix": frame.pose.tolist()},
                     "tags": ["door"] if view == 0 else [],
@@ -326,9 +328,9 @@ def run(station, page, settle):
     page.goto(f"{station.home}#/nowhere")
     settle(page)
 
-    def evaluate(module, expression, *given):
+    def evaluate(module, expression, *args):
         script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
-        return page.evaluate(script, [f"{station.url}/dashboard/{module}.js", list(given)])
+        return page.evaluate(script, [f"{station.url}/dashboard/{module}.js", list(args)])
 
     return evaluate
 
@@ -368,7 +370,7 @@ def axe():
     judge = Axe()
 
     def look(page):
-        found = []
+        results = []
         for theme in ("light", "dark"):
             page.emulate_media(color_scheme=theme)
             options = {"resultTypes": ["violations"]}
@@ -376,8 +378,8 @@ def axe():
                 options["runOnly"] = ["color-contrast"]
             for violation in judge.run(page, options=options).response["violations"]:
                 where = [node["html"][:200] for node in violation["nodes"][:5]]
-                found.append(f"{theme}: {violation['id']}: {violation['help']}: {where}")
-        return found
+                results.append(f"{theme}: {violation['id']}: {violation['help']}: {where}")
+        return results
 
     return look
 
@@ -392,8 +394,8 @@ def pixels():
 def written():
     """A function that returns a reason of the API as pages write it: 0.23° and 7.5 mm."""
 
-    def short(found):
-        length = float(found[1])
+    def short(match):
+        length = float(match[1])
         return f"{1000 * length:.{1 if length < 0.01 else 0}f} mm"
 
     return lambda text: re.sub(r"\b(0\.0\d+) m\b", short, re.sub(r"(\d) deg\b", r"\1°", text))

@@ -14,16 +14,16 @@ def test_steps_of_an_axis(call):
         (0, 3, 0, [0, 0.5, 1]),
         (21, 3, 1, [0, 10, 20, 30]),
     ]:
-        found = call("lib/scales", f"return m.steps({most}, {count}, {least})")
-        assert found == wanted, (most, found)
+        result = call("lib/scales", f"return m.steps({most}, {count}, {least})")
+        assert result == wanted, (most, result)
 
 
 def test_paths_leave_gaps_where_nothing_is_known(call):
-    given = (
+    values = (
         "const v = [null, 1, 3, null, 2, null, 0, 4], x = (i) => 10 * i, y = (n) => 40 - 10 * n;"
     )
     result = call(
-        "lib/scales", f"{given} return [m.linePath, m.dotPath, m.areaPath].map(f => f(v, x, y))"
+        "lib/scales", f"{values} return [m.linePath, m.dotPath, m.areaPath].map(f => f(v, x, y))"
     )
     assert result == [
         "M10 30L20 10M60 40L70 0",

@@ -133,8 +133,8 @@ def test_cells_are_ranked_by_what_robots_lose(run):
     """Worked out by hand: shares found less shares wrong are -1, 0, 0, 0.5 and 1."""
 
     def cell(column, **counts):
-        known = {"column": column, "row": 0, "frames": 9, "unchecked": 0}
-        return {**known, **dict.fromkeys(OUTCOMES, 0), **counts}
+        fields = {"column": column, "row": 0, "frames": 9, "unchecked": 0}
+        return {**fields, **dict.fromkeys(OUTCOMES, 0), **counts}
 
     cells = [
         cell(0, found=1, not_found=1), cell(1, found=3), cell(2, not_found=1), cell(3, ambiguous=2),

@@ -19,8 +19,8 @@ def ids(page):
 
 def listed(station, name, **wanted):
     """Frames of a page of 24 of the API."""
-    found = station.client.get(f"/v1/maps/{name}/frames", params={"limit": 24, **wanted}).json()
-    return [item["frame_id"] for item in found["items"]]
+    body = station.client.get(f"/v1/maps/{name}/frames", params={"limit": 24, **wanted}).json()
+    return [item["frame_id"] for item in body["items"]]
 
 
 def preview(station, path, **params):
@@ -230,8 +230,8 @@ def test_frames_are_found_selected_changed_and_restored(page, station, settle, u
         station.client.patch(f"{path}/frames/{one}", json={"session": session, "name": f"n{i}"})
 
     def sessions():
-        found = station.client.get(f"{path}/sessions").json()["items"]
-        return {one["session"]: sum(one["frames"].values()) for one in found}
+        body = station.client.get(f"{path}/sessions").json()["items"]
+        return {one["session"]: sum(one["frames"].values()) for one in body}
 
     page.goto(f"{station.home}#/maps/picked")
     settle(page)

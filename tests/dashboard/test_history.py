@@ -23,18 +23,18 @@ def answers(station):
             f"{path}/frames", headers={"Prefer": "wait=200"}, **form
         )  # fmt: skip
         assert added.json()["state"] == "indexed", added.text
-    found = []
-    for who, sent in (("spot", 0), ("cart", 1), (None, 8)):
+    results = []
+    for robot, sent in (("spot", 0), ("cart", 1), (None, 8)):
         form = station.frames[sent].form()
         camera = json.loads(form["data"]["meta"])
         form["data"]["meta"] = json.dumps(
-            camera | ({"robot": who, "session": "run"} if who else {})
+            camera | ({"robot": robot, "session": "run"} if robot else {})
         )
-        found.append(station.client.post(f"{path}/queries", **form).json())
+        results.append(station.client.post(f"{path}/queries", **form).json())
     form = station.frames[0].form(keep="false")
     form["files"] = {"frame": BROKEN}
     assert station.client.post(f"{path}/queries", **form).status_code == 422
-    return found
+    return results
 
 
 def records(station, **params):

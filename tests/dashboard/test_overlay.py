@@ -83,13 +83,13 @@ def test_what_is_shown_is_what_the_api_says(page, station, answer, settle, axe):
     assert moves.inner_text() in (f"{1000 * shift:.0f} mm", f"{shift:.2f} m")
     page.get_by_role("button", name="Residual").click()
     settle(page)
-    found = residuals(station, answer, best, "aligned")
+    result = residuals(station, answer, best, "aligned")
     legend = text(page, ".overlay-legend")
     for words, share in (
-        ("within 10 mm", (found <= 50).mean()),
-        ("within 20 mm", ((found > 50) & (found <= 100)).mean()),
-        ("the other sensor saw through", (found == 254).mean()),
-        ("farther, hidden, or outside the view of the other", (found == 253).mean()),
+        ("within 10 mm", (result <= 50).mean()),
+        ("within 20 mm", ((result > 50) & (result <= 100)).mean()),
+        ("the other sensor saw through", (result == 254).mean()),
+        ("farther, hidden, or outside the view of the other", (result == 253).mean()),
     ):  # fmt: skip
         assert f"{words} {percent(share)}" in legend
     assert axe(page) == []

@@ -22,14 +22,14 @@ def apart(station, until):
     path = station.make_map("apart")
     metas, files = [], []
     for i, sent in enumerate([*station.frames[:8], station.frames[8]]):
-        who = "carol" if i == 8 else "bob" if i % 2 else "ann"
-        meta = {**sent.meta, "session": who, "robot": None}
-        if who == "carol":
+        robot = "carol" if i == 8 else "bob" if i % 2 else "ann"
+        meta = {**sent.meta, "session": robot, "robot": None}
+        if robot == "carol":
             del meta["pose"]
         else:
             pose = np.array(sent.meta["pose"]["matrix"])
-            moved = B_FROM_A @ pose if who == "bob" else pose
-            meta["pose"] = {"parent_frame": f"{who}/odom", "matrix": moved.tolist()}
+            moved = B_FROM_A @ pose if robot == "bob" else pose
+            meta["pose"] = {"parent_frame": f"{robot}/odom", "matrix": moved.tolist()}
         metas.append(meta)
         files.append(("frame", (f"{i}.png", sent.png, "image/png")))
     answer = station.client.post(
@@ -131,9 +131,9 @@ def test_numbers_behind_the_picture(run):
     for scale in (1.0, 1e-4):
         root = rng.normal(size=(3, 3)) * scale
         covariance = root @ root.T
-        found = run("paths/shapes", "m.axesOf(given[0])", covariance.tolist())
+        result = run("paths/shapes", "m.axesOf(given[0])", covariance.tolist())
         values, vectors = np.linalg.eigh(covariance)
-        for one, value, vector in zip(found, values[::-1], vectors.T[::-1], strict=True):
+        for one, value, vector in zip(result, values[::-1], vectors.T[::-1], strict=True):
             assert one["deviation"] == pytest.approx(np.sqrt(value), rel=1e-6)
             assert abs(np.dot(one["axis"], vector)) == pytest.approx(1, abs=1e-6)
     # cameras look level along x: their down is the map's -z; a camera's own axes: down is y

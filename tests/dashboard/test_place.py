@@ -99,7 +99,7 @@ def patrolled(station):
         form["data"]["meta"] = json.dumps(sent.meta)
         added = station.client.post(f"{path}/frames", headers={"Prefer": "wait=200"}, **form)
         assert added.json()["state"] == "indexed", added.text
-    answers = [ask(station, who, sent) for who, sent in
+    answers = [ask(station, robot, sent) for robot, sent in
                (("spot", 0), ("cart", 1), ("cart", 8), ("spot", 2))]  # fmt: skip
     assert [answer["status"] for answer in answers] == ["found", "found", "not_found", "found"]
     return {"path": path, "answers": answers}

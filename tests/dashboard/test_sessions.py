@@ -28,9 +28,9 @@ def runs(station):
 
 def listed(station, path):
     """Frames and tags by session and robot, as the API has them."""
-    found = station.client.get(f"{path}/sessions").json()["items"]
+    body = station.client.get(f"{path}/sessions").json()["items"]
     return {
-        (one["session"], one["robot"]): (sum(one["frames"].values()), one["tags"]) for one in found
+        (one["session"], one["robot"]): (sum(one["frames"].values()), one["tags"]) for one in body
     }
 
 

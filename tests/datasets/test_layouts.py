@@ -134,11 +134,11 @@ def test_what_is_left_out_is_named(tmp_path):
         write_depth_png(scene / folder / "0.png", DEPTH, 1000.0)
     write_intrinsics(scene, CAMERA)
     write_depth_png(scene / "depth" / "confidence_0.png", DEPTH, 1000.0)
-    found = find_sequences(scene)
-    assert [s.name for s in found] == ["aligned_depth_to_color", "depth"]
-    assert [f.path.name for s in found for f in s.frames] == ["0.png", "0.png"]
-    assert found[0].note.startswith("skipped: scene/ir, scene/depth/confidence_0.png (colour, ")
-    assert found[1].note == ""
+    sequences = find_sequences(scene)
+    assert [s.name for s in sequences] == ["aligned_depth_to_color", "depth"]
+    assert [f.path.name for s in sequences for f in s.frames] == ["0.png", "0.png"]
+    assert sequences[0].note.startswith("skipped: scene/ir, scene/depth/confidence_0.png (colour, ")
+    assert sequences[1].note == ""
     (sequence,) = find_sequences(scene / "ir")
     assert len(sequence.frames) == 1
     for image in scene.glob("*depth*/?.png"):

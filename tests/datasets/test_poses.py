@@ -144,8 +144,8 @@ def test_a_near_pose_stands_where_nothing_is_interpolated():
     trajectory = SensorTrajectory(np.array([1.0, 1.03, 2.0]), positions, one)
     stamps = [0.97, 0.985, 1.015, 1.049, 1.06, 1.981, 1.9999999, 2.019, 2.021, math.nan]
     poses = interpolate(trajectory, stamps, tolerance=0.02)
-    found = [None if pose is None else round(pose[0, 3], 9) for pose in poses]
-    assert found == [None, 1.0, 1.5, 2.0, None, 4.0, 4.0, 4.0, None, None]
+    result = [None if pose is None else round(pose[0, 3], 9) for pose in poses]
+    assert result == [None, 1.0, 1.5, 2.0, None, 4.0, 4.0, 4.0, None, None]
 
 
 def test_trajectory_files(tmp_path):

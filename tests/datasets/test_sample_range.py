@@ -18,16 +18,16 @@ def of(near, median, far, valid=0.875):
 def test_the_range_of_depth_leaves_missing_pixels_out():
     depth = np.zeros((25, 8), np.float32)
     depth.flat[:101] = np.arange(0, 101) / 10  # the first is missing: 0.1 to 10 m
-    found = sample_range(DepthFrame(depth, Intrinsics(8, 25, 9, 9, 4, 12)))
-    assert (found.count, found.valid) == (100, 0.5)
-    assert [found.near, found.median, found.far] == pytest.approx([0.595, 5.05, 9.505])
+    result = sample_range(DepthFrame(depth, Intrinsics(8, 25, 9, 9, 4, 12)))
+    assert (result.count, result.valid) == (100, 0.5)
+    assert [result.near, result.median, result.far] == pytest.approx([0.595, 5.05, 9.505])
 
 
 def test_the_range_of_points_is_their_distance_from_the_sensor():
     points = np.zeros((101, 3), np.float32)
     points[:, 1] = -np.arange(101)
-    found = sample_range(Cloud(points))
-    assert found == SampleRange(near=5.0, median=50.0, far=95.0, count=101)
+    result = sample_range(Cloud(points))
+    assert result == SampleRange(near=5.0, median=50.0, far=95.0, count=101)
 
 
 @pytest.mark.parametrize(("near", "median", "far"), REAL)

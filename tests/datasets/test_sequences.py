@@ -30,28 +30,28 @@ def kitchen(tmp_path):
 
 
 def test_a_scene(kitchen):
-    found = find_sequences(kitchen)
-    assert [s.name for s in found] == ["seq-01", "seq-02", "seq-10"]
-    assert [s.split for s in found] == ["train", "test", "train"]
-    assert {s.layout for s in found} == {Layout.SEVEN_SCENES}
-    assert {s.parent_frame for s in found} == {"kitchen"}
-    assert found[1].folder == kitchen / "seq-02"
-    assert [f.name for f in found[1].frames] == ["seq-02/frame-000000", "seq-02/frame-000001"]
-    frame = found[1].frames[1].read()
+    runs = find_sequences(kitchen)
+    assert [s.name for s in runs] == ["seq-01", "seq-02", "seq-10"]
+    assert [s.split for s in runs] == ["train", "test", "train"]
+    assert {s.layout for s in runs} == {Layout.SEVEN_SCENES}
+    assert {s.parent_frame for s in runs} == {"kitchen"}
+    assert runs[1].folder == kitchen / "seq-02"
+    assert [f.name for f in runs[1].frames] == ["seq-02/frame-000000", "seq-02/frame-000001"]
+    frame = runs[1].frames[1].read()
     np.testing.assert_array_equal(frame.depth, DEPTH + 1)
     np.testing.assert_array_equal(frame.pose, pose_at(1))
     assert frame.name == "seq-02/frame-000001"
-    assert found[1].frames[1].timestamp is None
+    assert runs[1].frames[1].timestamp is None
 
 
 def test_a_camera_that_is_given_stands_in_for_a_missing_one_alone(kitchen):
-    given = Camera(Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0))
-    assert {f.camera for s in find_sequences(kitchen, camera=given) for f in s.frames} == {CAMERA}
+    values = Camera(Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0))
+    assert {f.camera for s in find_sequences(kitchen, camera=values) for f in s.frames} == {CAMERA}
     (kitchen / "intrinsics.json").unlink()
-    assert {f.camera for s in find_sequences(kitchen, camera=given) for f in s.frames} == {given}
+    assert {f.camera for s in find_sequences(kitchen, camera=values) for f in s.frames} == {values}
     (kitchen / "intrinsics.json").write_text("{}")
     with pytest.raises(InvalidIntrinsics):
-        find_sequences(kitchen, camera=given)
+        find_sequences(kitchen, camera=values)
 
 
 def test_a_pose_is_read_when_asked_for(kitchen):
@@ -160,9 +160,9 @@ def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen):
         sequences = numbered_sequences(found, session)
         return [[frame.sequence for frame in one.frames] for one in sequences]
 
-    found = find_sequences(kitchen)
-    assert places(found, None) == [[0, 1], [0, 1], [0, 1]]
-    assert places(found, "all") == [[0, 1], [2, 3], [4, 5]]
+    runs = find_sequences(kitchen)
+    assert places(runs, None) == [[0, 1], [0, 1], [0, 1]]
+    assert places(runs, "all") == [[0, 1], [2, 3], [4, 5]]
     # files of one folder, named one by one, keep its numbers
     files = [kitchen / f"seq-{s}/frame-00000{i}.depth.png" for s in ("02", "01") for i in (1, 0)]
     singles = [sequence for file in files for sequence in find_sequences(file)]

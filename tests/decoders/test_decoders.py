@@ -65,12 +65,12 @@ def test_arrays_are_the_same_as_in_this_process(pool):
 
 
 def test_a_decoder_reaches_nothing(pool, tmp_path):
-    found = do(pool, "escape", path=str(tmp_path / "escaped"))
+    result = do(pool, "escape", path=str(tmp_path / "escaped"))
     seccomp = pool.processes()[0].seccomp
     assert seccomp == Path("/proc/sys/kernel/seccomp/actions_avail").exists()
     if not seccomp:
         pytest.skip("this kernel has no seccomp")
-    assert found == dict.fromkeys(
+    assert result == dict.fromkeys(
         ("socket", "read", "write", "fork", "exec", "signal", "list"), errno.EPERM
     )
     assert list(tmp_path.iterdir()) == []

@@ -92,8 +92,8 @@ def make_upload(tmp_path_factory):
         camera = CameraIntrinsics(
             width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy
         )
-        given = GivenPose(parent_frame=room, matrix=pose.tolist())
-        meta = FrameMeta.model_validate({"intrinsics": camera, "pose": given} | more)
+        placed = GivenPose(parent_frame=room, matrix=pose.tolist())
+        meta = FrameMeta.model_validate({"intrinsics": camera, "pose": placed} | more)
         return Upload(data, meta, decode_frame(data, k), pose, room)
 
     return make

@@ -235,8 +235,8 @@ LEVEL = PlanAxes(np.eye(3)[:2], "map")
 
 
 def cell(column, row, frames=0, **counts):
-    known = {"found": 0, "wrong": 0, "ambiguous": 0, "not_found": 0} | counts
-    return CoverageCell(column=column, row=row, frames=frames, **known)
+    fields = {"found": 0, "wrong": 0, "ambiguous": 0, "not_found": 0} | counts
+    return CoverageCell(column=column, row=row, frames=frames, **fields)
 
 
 def plan(*cells, parent="map"):
@@ -245,8 +245,8 @@ def plan(*cells, parent="map"):
     )
 
 
-def queried(*given):
-    return [QueriedPosition(np.array([x, y, 7.0]), outcome) for x, y, outcome in given]
+def queried(*args):
+    return [QueriedPosition(np.array([x, y, 7.0]), outcome) for x, y, outcome in args]
 
 
 def test_frames_are_counted_by_cell():

@@ -122,19 +122,19 @@ def test_lists_and_queries_see_it_at_once(full):
     tagged = Query(stages=("retrieve",), filter=Filter(tags=["seen"]))
     inside = Query.model_validate({"stages": ["retrieve"], "filter": {"region": box}})
 
-    def found():
+    def frame_lists():
         answers = (full.query_frame("hall", second, query) for query in (tagged, inside))
         return [[match.frame_id for match in answer.matches] for answer in answers]
 
-    assert found() == [[], []]
+    assert frame_lists() == [[], []]
     edit_frame(full.store, "hall", first, {"tags": ["seen"], "pose": {"parent_frame": "p"}})
-    assert found() == [[first], []]
+    assert frame_lists() == [[first], []]
     for wanted in (FrameListing(tag=["seen"]), FrameListing(parent_frame="p")):
         assert [f.frame_id for f in full.list_frames("hall", wanted=wanted).items] == [first]
     edit_frame(full.store, "hall", first, {"pose": {"translation": {"x": 7, "y": 7, "z": 7}}})
-    assert found() == [[first], [first]]
+    assert frame_lists() == [[first], [first]]
     edit_frame(full.store, "hall", first, {"pose": None, "tags": []})
-    assert found() == [[], []]
+    assert frame_lists() == [[], []]
 
 
 def test_events_tell_what_was_edited(full):

@@ -27,11 +27,11 @@ def after(engine, days):
 
 
 def rows(engine):
-    found = engine.fetch(select(frames.c.id, frames.c.state).order_by(frames.c.number))
-    return [(one[0], one[1]) for one in found]
+    result = engine.fetch(select(frames.c.id, frames.c.state).order_by(frames.c.number))
+    return [(one[0], one[1]) for one in result]
 
 
-def found(engine, uploads):
+def matches_of(engine, uploads):
     answer = engine.ask(uploads[2], ALL)
     return sorted(match.frame_id for match in answer.matches)
 
@@ -108,14 +108,14 @@ def test_a_reader_that_missed_deletions_begins_anew(data, make_engine, uploads, 
     reader, builder = (make_engine(data, unindexed_frames=tail_frames) for _ in range(2))
     assert builder.publish_due() == (tail_frames == 3)
     names = builder.ids()
-    assert found(reader, uploads) == sorted(names)
+    assert matches_of(reader, uploads) == sorted(names)
     builder.tombstones = Tombstones(builder.store, 0.0, builder.bell.ring)
     for name in names[4:6]:
         builder.delete_frame("hall", name)
     assert after(builder, DAYS + 1) == 2
     left = sorted(set(names) - set(names[4:6]))
     for engine in (reader, make_engine(data, unindexed_frames=tail_frames)):
-        assert found(engine, uploads) == left
+        assert matches_of(engine, uploads) == left
         assert engine.view("hall")[2].size == 10
 
 

@@ -110,9 +110,9 @@ def test_a_prior_tells_equal_rooms_apart(twins):
 def test_what_the_deadline_leaves_uncompared_is_not_found(twins, monkeypatch):
     passed, look, clock = [0.0], rival_rows, time.perf_counter
 
-    def late(*given):
+    def late(*args):
         passed[0] = 3600.0
-        return look(*given)
+        return look(*args)
 
     monkeypatch.setattr(RIVAL_ROWS, late)
     monkeypatch.setattr(

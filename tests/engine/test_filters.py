@@ -109,7 +109,7 @@ def hold(answer, frames, own, wanted):
 def draw(rng, frames):
     seconds = [int(integer) for integer in sorted(rng.integers(0, 60, 2))]
     corners = np.sort(rng.integers(-2, 3, (2, 3)), axis=0).tolist()
-    given = {
+    fields = {
         "robot": "r1" if rng.random() < 0.5 else ["r2", "r3"],
         "session": rng.choice(["s1", "s2"]),
         "captured_after": START + timedelta(seconds=seconds[0]),
@@ -123,8 +123,8 @@ def draw(rng, frames):
         },
         "exclude_frames": [one.id for one in rng.choice(np.array(frames, object), 9)],
     }  # fmt: skip
-    chosen = rng.permutation(list(given))[: rng.integers(1, 4)]
-    return Filter.model_validate({name: given[name] for name in chosen})
+    chosen = rng.permutation(list(fields))[: rng.integers(1, 4)]
+    return Filter.model_validate({name: fields[name] for name in chosen})
 
 
 def ask(engine, own, wanted, *, exact=False):
@@ -156,12 +156,12 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine, published):
     assert min(sizes) == 0
     assert sum(size > 20 for size in sizes) > 10
     own = askers[0]
-    for given in (
+    for options in (
         {}, {"captured_after": own.at, "captured_before": own.at},  # bounds are inside
         {"captured_before": own.at.astimezone(timezone(timedelta(hours=5)))},  # the same moment
         {"not_within_s": 1e300}, {"exclude_frames": [f.id for f in frames[:90]] + ["nobody"]},
     ):  # fmt: skip
-        wanted = Filter.model_validate(given)
+        wanted = Filter.model_validate(options)
         assert hold(ask(engine, own, wanted), frames, own, wanted) > 0
 
 

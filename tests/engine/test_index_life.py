@@ -114,15 +114,15 @@ def more(uploads):
             shift = next(shifts)
             meta = uploads[shift % 12].meta
             camera = meta.intrinsics.model_copy(update={"cx": meta.intrinsics.cx + shift / 2})
-            given = meta.model_copy(update={"intrinsics": camera})
-            added.append(engine.add_frame("hall", uploads[shift % 12].data, given)[0].frame_id)
+            own_meta = meta.model_copy(update={"intrinsics": camera})
+            added.append(engine.add_frame("hall", uploads[shift % 12].data, own_meta)[0].frame_id)
         assert engine.work_off() == [JobState.SUCCEEDED] * count
         return added
 
     return add
 
 
-def found(answer):
+def matches_of(answer):
     assert answer.counts.map == answer.counts.ranked == len(answer.matches)
     return [(match.frame_id, match.distance) for match in answer.matches]
 
@@ -135,7 +135,7 @@ def truth(make, uploads, folder, tmp_path):
     fresh = make(folder, index_dir=tmp_path / "none", unindexed_frames=100_000)
     answer = ask(fresh, uploads)
     assert answer.index_version == 0
-    return found(answer)
+    return matches_of(answer)
 
 
 def test_publishing_changes_no_answer(data, make_engine, uploads, more):
@@ -154,12 +154,12 @@ def test_publishing_changes_no_answer(data, make_engine, uploads, more):
             assert new.model_copy(update=free) == old.model_copy(update=free)
     gone = reader.ids()[3]
     builder.delete_frame("hall", gone)
-    left = [pair for pair in found(before[0]) if pair[0] != gone]
+    left = [pair for pair in matches_of(before[0]) if pair[0] != gone]
     for engine in (reader, fresh, make_engine(data, unindexed_frames=5)):
-        assert found(ask(engine, uploads)) == left  # at once, and whoever deleted it
+        assert matches_of(ask(engine, uploads)) == left  # at once, and whoever deleted it
     shutil.rmtree(data / "index")
     for engine in (reader, fresh, make_engine(data, unindexed_frames=5)):
-        assert found(ask(engine, uploads)) == left
+        assert matches_of(ask(engine, uploads)) == left
     assert builder.publish_due() == 1  # it sees that what it published is gone
     assert make_engine(data, unindexed_frames=5).publish_due() == 0
 
@@ -182,7 +182,7 @@ def test_readers_follow_a_map_through_versions(data, make_engine, uploads, more,
         wanted = truth(make_engine, uploads, data, tmp_path)
         assert len(wanted) == 12  # two came, two went
         for engine in (first, late, make_engine(data, unindexed_frames=3)):
-            assert found(ask(engine, uploads)) == wanted
+            assert matches_of(ask(engine, uploads)) == wanted
     assert builder.publish_due() == 1  # six deletions; of frames alone three were left to index
     new = more(builder, 3)
     assert builder.publish_due() == 0
@@ -193,24 +193,24 @@ def test_readers_follow_a_map_through_versions(data, make_engine, uploads, more,
     wanted = truth(make_engine, uploads, data, tmp_path)
     for engine in (first, late, make_engine(data, unindexed_frames=3)):
         answer = ask(engine, uploads)
-        assert (found(answer), answer.index_version) == (wanted, 3)
+        assert (matches_of(answer), answer.index_version) == (wanted, 3)
     more(builder, 3)
     wanted = truth(make_engine, uploads, data, tmp_path)
     for engine in (first, late):
-        assert found(ask(engine, uploads)) == wanted
+        assert matches_of(ask(engine, uploads)) == wanted
 
 
 def test_a_map_made_anew_has_none_of_the_old_frames(data, make_engine, uploads):
     reader, other = make_engine(data, unindexed_frames=5), make_engine(data, unindexed_frames=5)
-    assert len(found(ask(reader, uploads))) == len(found(ask(other, uploads))) == 12
+    assert len(matches_of(ask(reader, uploads))) == len(matches_of(ask(other, uploads))) == 12
     assert other.publish_due() == 1
     other.delete_map("hall")
     other.create_map(NewMap(name="hall", model="depth"))
     for engine in (reader, other, make_engine(data, unindexed_frames=5)):
-        assert found(ask(engine, uploads)) == []
+        assert matches_of(ask(engine, uploads)) == []
     added, _ = other.add(uploads[7])
     assert other.work_off() == [JobState.SUCCEEDED]
     for engine in (reader, other, make_engine(data, unindexed_frames=5)):
         answer = ask(engine, uploads, 7)
-        assert found(answer) == [(added.frame_id, 0)]
+        assert matches_of(answer) == [(added.frame_id, 0)]
         assert answer.index_version == 0

@@ -182,8 +182,8 @@ def test_a_killed_pull_leaves_the_copy_and_goes_on(robot, walk, tmp_path):
     upload(service, walk[2:6])
 
     def kill(what, count):
-        given = [tmp_path / "service", robot.folder, what, str(count)]
-        ran = subprocess.run([sys.executable, "-c", CHILD, *given], check=False)
+        arguments = [tmp_path / "service", robot.folder, what, str(count)]
+        ran = subprocess.run([sys.executable, "-c", CHILD, *arguments], check=False)
         assert ran.returncode == -signal.SIGKILL
         assert robot.answers(queries) == before
 

@@ -40,7 +40,7 @@ def send(uploads):
     return run
 
 
-def found(engine, uploads):
+def matches_of(engine, uploads):
     query = Query(stages=("retrieve",), k=50)
     answer = engine.ask(uploads[0], query)
     return {match.frame_id for match in answer.matches}
@@ -65,11 +65,11 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(empty, uploads, send, share
     )
     assert set(empty.store.blobs.digests()) == blobs  # neither its upload nor its artifact
     assert rows(empty) == 1
-    assert found(empty, uploads) == {first.frame_id}
+    assert matches_of(empty, uploads) == {first.frame_id}
     assert empty.get_map("hall").frames == {"indexed": 1, "redundant": 1}
     third = send(empty, 7, between)
     assert third.state == FrameState.INDEXED
-    assert found(empty, uploads) == {first.frame_id, third.frame_id}
+    assert matches_of(empty, uploads) == {first.frame_id, third.frame_id}
     assert empty.event_kinds()[1:] == ["frame.received", "frame.indexed", "frame.received",
                                "frame.redundant", "frame.received", "frame.indexed"]  # fmt: skip
     assert send(empty, 2).state == FrameState.INDEXED  # without the condition
@@ -99,7 +99,7 @@ def test_what_is_gone_is_no_place_and_a_frame_may_come_again(empty, uploads, sen
     assert (kept.state, kept.reason) == (FrameState.INDEXED, None)
     assert kept.frame_id == redundant.frame_id
     assert len({redundant.job_id, still.job_id, kept.job_id}) == 3
-    assert found(empty, uploads) == {kept.frame_id}
+    assert matches_of(empty, uploads) == {kept.frame_id}
     assert len(list(empty.store.blobs.digests())) == blob_count
     added, new = empty.add_frame("hall", uploads[1].data, uploads[1].meta, if_novel=1.0)
     assert (added.frame_id, added.state, new) == (kept.frame_id, FrameState.INDEXED, False)
@@ -140,8 +140,8 @@ def test_of_two_that_are_signed_at_once_one_is_kept(make_engine, uploads, monkey
         engines[0].add_frame("hall", uploads[which].data, uploads[which].meta, if_novel=1.0)
     looked = threading.Barrier(2)
 
-    def together(*given):
-        seen = find_nearest(*given)
+    def together(*args):
+        seen = find_nearest(*args)
         assert seen.nearest is None
         looked.wait(PATIENCE_S)
         return seen
@@ -164,8 +164,8 @@ def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(
     assert share(3, 2) < share(3, 1)
     looks = []
 
-    def interrupted(*given):
-        looks.append(find_nearest(*given))
+    def interrupted(*args):
+        looks.append(find_nearest(*args))
         if len(looks) == 1:
             empty.delete_frame("hall", nearest.frame_id)
         return looks[-1]

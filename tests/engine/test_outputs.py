@@ -178,8 +178,8 @@ def listed(engine, map_name="hall", **wanted):
 
 
 def send(engine, upload, **more):
-    known = upload.meta.model_dump() | more
-    added, new = engine.add_frame("hall", upload.data, FrameMeta.model_validate(known))
+    fields = upload.meta.model_dump() | more
+    added, new = engine.add_frame("hall", upload.data, FrameMeta.model_validate(fields))
     return added.frame_id, new
 
 

@@ -71,8 +71,8 @@ def places(engine, folder, wanted):
 def lived_in(make_engine, store_url, uploads, tmp_path):
     """A map whose index was published twice."""
     (tmp_path / "data" / "blobs").mkdir(parents=True)  # of a database that is there nobody makes it
-    given = {"database_url": store_url, "unindexed_frames": 2}
-    engine = make_engine(tmp_path / "data", **given)
+    settings = {"database_url": store_url, "unindexed_frames": 2}
+    engine = make_engine(tmp_path / "data", **settings)
     engine.create_map(NewMap(name="hall", model="depth"))
     for upload in uploads[:6]:
         meta = upload.meta.model_copy(update={"tags": ["by-the-door"], "session": "one-morning"})

@@ -146,9 +146,9 @@ def test_pages_and_filters(engine):
     start = time.time()
     for i in range(7):
         status = "found" if i % 2 else "failed"
-        home, who = ("attic" if i == 3 else "hall"), ("spot" if i in (1, 3) else None)
+        home, robot = ("attic" if i == 3 else "hall"), ("spot" if i in (1, 3) else None)
         # two at one moment: a page may end between them
-        engine.query_log.note(row(i, at=start + i // 2, map=home, robot=who, status=status))
+        engine.query_log.note(row(i, at=start + i // 2, map=home, robot=robot, status=status))
     engine.query_log.note(row(7, listed=False), stored())
     for names, wanted, expected in (
         (None, {}, [6, 5, 4, 3, 2, 1, 0]), (["hall"], {}, [6, 5, 4, 2, 1, 0]),
@@ -278,8 +278,8 @@ def test_the_oldest_answers_go_where_room_is_needed(engine):
     log = log_of(engine, query_log_bytes=30_000)
     start = time.time()  # a clock may be set back
     names = [log_answer(engine, 1000, log, listed=i % 2 == 0, at=start + i) for i in range(40)]
-    kept = names[39]
-    log.keep(kept, None)
+    query_id = names[39]
+    log.keep(query_id, None)
     log.remove_surplus()
     with engine.store.database.read() as connection:
         held = connection.execute(select(func.sum(queries.c.bytes))).scalar_one()
@@ -287,7 +287,7 @@ def test_the_oldest_answers_go_where_room_is_needed(engine):
         there = set(connection.execute(of_answers).scalars())
     assert 20_000 < held <= 30_000
     assert there == set(names[-len(there) :])
-    assert files_of(engine) == there - {kept}  # which is in the database
+    assert files_of(engine) == there - {query_id}  # which is in the database
     # a listed query stays without its answer, and of the others nothing
     assert count(engine, queries.c.listed) == 20
     assert count(engine, ~queries.c.listed) == len(there & set(names[1::2]))
@@ -333,28 +333,28 @@ def test_old_and_surplus_queries_are_removed_in_blocks(engine, monkeypatch):
 
 
 def test_a_kept_answer_stays_until_it_is_released(engine, make_engine):
-    kept, other = log_answer(engine), log_answer(engine)
-    record = engine.query_log.keep(kept, "by the door")
+    query_id, other = log_answer(engine), log_answer(engine)
+    record = engine.query_log.keep(query_id, "by the door")
     assert (record.title, record.expires_at, record.stored) == ("by the door", None, True)
-    again = engine.query_log.keep(kept, "the door")
+    again = engine.query_log.keep(query_id, "the door")
     assert (again.title, again.kept_at) == ("the door", record.kept_at)
     with engine.store.database.write() as connection:
         connection.execute(update(queries).values(at=time.time() - 40 * DAY_S))
         connection.exec_driver_sql("UPDATE maps SET created_at = 0")
     engine.query_log.remove_surplus()
     second = make_engine()
-    assert second.query_log.find(kept).answer.query_id == kept
+    assert second.query_log.find(query_id).answer.query_id == query_id
     page = second.query_log.page(WantedQueries(kept=True), None, None, 9)
-    assert [item.query_id for item in page.items] == [kept]
+    assert [item.query_id for item in page.items] == [query_id]
     assert files_of(engine) == set()
-    second.query_log.release(kept)
-    assert second.query_log.record(kept).kept_at is None
+    second.query_log.release(query_id)
+    assert second.query_log.record(query_id).kept_at is None
     second.query_log.remove_surplus()
-    for missing in (kept, other):
+    for missing in (query_id, other):
         with pytest.raises(UnknownQuery):
             engine.query_log.find(missing)
     with pytest.raises(UnknownQuery):
-        engine.query_log.release(kept)
+        engine.query_log.release(query_id)
 
 
 def test_so_many_answers_are_kept(engine, monkeypatch):

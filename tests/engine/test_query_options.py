@@ -55,8 +55,8 @@ def test_the_scales_of_diversity_are_those_of_the_library(full, prepared):
     order = np.argsort(d, kind="stable")
     for omega in (0.01, 4.0, 1000.0):
         p = DiversityParameters(0.7, omega)
-        taken = diversify(d[order], pairwise_distances(vectors[order], "l2"), 4, p)
-        pairs = zip(taken.indices, taken.gains, strict=True)
+        selection = diversify(d[order], pairwise_distances(vectors[order], "l2"), 4, p)
+        pairs = zip(selection.indices, selection.gains, strict=True)
         wanted = {names[1 + order[i]]: gain for i, gain in pairs}
         stages = ["retrieve", "diversify"]
         answer = ask(full, names[0], k=4, stages=stages, diversity={"sigma": 0.7, "omega": omega})
@@ -264,10 +264,10 @@ def test_what_an_approximate_index_missed_is_said(full, monkeypatch):
     real, lost = local_index.search, near[1]
     number = names.index(lost) + 1
 
-    def search(*given, dead, exact, **more):
+    def search(*args, dead, exact, **more):
         if exact:
-            return real(*given, dead=dead, exact=True, **more)
-        return replace(real(*given, dead=dead | {number}, exact=False, **more), exact=False)
+            return real(*args, dead=dead, exact=True, **more)
+        return replace(real(*args, dead=dead | {number}, exact=False, **more), exact=False)
 
     monkeypatch.setattr(local_index, "search", search)
     monkeypatch.setattr(retrieval, "ranking_size", lambda n: min(n, 3))

@@ -76,8 +76,8 @@ def said(engine, answer):
 
 def models_of(engine):
     """How many signatures each model has."""
-    found = engine.fetch(select(signatures.c.model_id)).scalars().all()
-    return {model_id: found.count(model_id) for model_id in set(found)}
+    rows = engine.fetch(select(signatures.c.model_id)).scalars().all()
+    return {model_id: rows.count(model_id) for model_id in set(rows)}
 
 
 def queued(engine):
@@ -252,7 +252,7 @@ def useless(*_):
     raise UselessFrame("nothing")
 
 
-def found(answer):
+def matches_of(answer):
     return [(match.frame_id, match.distance) for match in answer.matches]
 
 
@@ -269,8 +269,8 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     names, models = full.ids(), [small_file, "depth", small_file, "depth"]
 
     def then_switch(step):
-        def run(*given, **more):
-            result = step(*given, **more)
+        def run(*args, **more):
+            result = step(*args, **more)
             if models:
                 switch(full, models.pop(0))
             return result
@@ -282,11 +282,11 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     del models[1:]
     answer = full.ask(uploads[4])
     assert answer.model.startswith("small-")
-    assert found(full.ask(uploads[4], R)) == right(names, by_model, answer.model, 4)
+    assert matches_of(full.ask(uploads[4], R)) == right(names, by_model, answer.model, 4)
     models[:] = ["depth"]
     answer = full.query_frame("hall", names[4], R)
     assert answer.model.startswith("depth-")
-    assert found(answer) == right(names, by_model, answer.model, 4)[1:]
+    assert matches_of(answer) == right(names, by_model, answer.model, 4)[1:]
     monkeypatch.undo()
     monkeypatch.setattr(query, "answer", then_switch(query.answer))
     models[:] = [small_file]
@@ -303,8 +303,8 @@ def test_signatures_of_two_models_are_not_compared_whatever_their_length(
     row = full.row("hall")
     decoders = full.store.decoders
     request = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R, decoders)
-    given = ([row], request, R, Deadline(None))
-    assert full.queries.answer(*given).matches[0].distance == 0
+    values = ([row], request, R, Deadline(None))
+    assert full.queries.answer(*values).matches[0].distance == 0
     with pytest.raises(ModelMismatch, match="two models cannot be compared"):
         full.queries.answer([row], replace(request, model_id=whitened_model.id), R, Deadline(None))
 
@@ -323,7 +323,7 @@ def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
     assert len(list(empty.store.blobs.digests())) == 3 + 2
     assert empty.work_off() == [JobState.SUCCEEDED]
     answer = empty.ask(uploads[2], R)
-    assert (answer.counts.map, found(answer)[0]) == (3, (added.frame_id, 0))
+    assert (answer.counts.map, matches_of(answer)[0]) == (3, (added.frame_id, 0))
     # and one in which the former model finds nothing is not rejected for it
     added, _ = empty.add(uploads[3])
     held = empty.claim("slow")
@@ -350,7 +350,7 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
     engine.publish_due()
     answer = engine.ask(uploads[4], R)
     assert (answer.index_version, answer.counts.map) == (1, 12)
-    assert found(answer) == right(names, by_model, answer.model, 4)
+    assert matches_of(answer) == right(names, by_model, answer.model, 4)
     assert not before.exists()
     after = index_folder(engine.settings.indexes, engine.row("hall"))
     assert [path for path in engine.settings.indexes.iterdir() if path.is_dir()] == [after]
@@ -376,12 +376,12 @@ def test_a_rejected_frame_is_gone_for_readers_that_knew_it(
     other = (at + 1) % 12
     wanted = right(names, by_model, full.get_map("hall").model, other)
     answer = sleeper.ask(uploads[other], R)
-    assert found(answer) == [one for one in wanted if one[0] != blind.frame.id]
+    assert matches_of(answer) == [one for one in wanted if one[0] != blind.frame.id]
     # what one model rejects another has to look at: it is found again
     assert full.get_frame("hall", blind.frame.id).state == FrameState.RECEIVED
     assert full.work_off() == [JobState.SUCCEEDED]
     answer = sleeper.ask(uploads[other], R)
-    assert found(answer) == wanted
+    assert matches_of(answer) == wanted
 
 
 #: Works as a worker does, and stands still after a step of which it tells.
@@ -443,7 +443,7 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
     label = full.get_map("hall").model
     assert label.startswith("small-") == switched
     answer = full.ask(uploads[7], R)
-    assert found(answer) == right(names, by_model, label, 7)
+    assert matches_of(answer) == right(names, by_model, label, 7)
     full.make_due()
     other = make_engine(full.settings.data_dir, unindexed_frames=5)
     other.work_off()
@@ -453,7 +453,7 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
     for engine in (full, other):
         answer = engine.ask(uploads[7], R)
         assert answer.model.startswith("small-")
-        assert found(answer) == right(names, by_model, answer.model, 7)
+        assert matches_of(answer) == right(names, by_model, answer.model, 7)
     assert models_of(other) == {other.get_map("hall").model_id: 12}
     digests = set(other.store.blobs.digests())
     assert {hashlib.sha256(each.data).hexdigest() for each in uploads} <= digests

@@ -29,8 +29,8 @@ def fill(engine, uploads, taken):
     """Add frames that nobody signs: states do not matter."""
     ids = []
     for i, (upload, (session, robot, tags)) in enumerate(zip(uploads, taken, strict=True)):
-        known = {"session": session, "robot": robot, "tags": tags, "name": f"{i:02d}.png"}
-        meta = FrameMeta.model_validate(upload.meta.model_dump() | known)
+        fields = {"session": session, "robot": robot, "tags": tags, "name": f"{i:02d}.png"}
+        meta = FrameMeta.model_validate(upload.meta.model_dump() | fields)
         ids.append(engine.add_frame("hall", upload.data, meta)[0].frame_id)
     return ids
 
@@ -144,16 +144,16 @@ def test_too_many_tags_are_refused(empty, ids):
 
 
 @pytest.mark.parametrize(
-    "given",
+    "fields",
     [
         {}, {"frame_ids": []}, {"frame_ids": ["a"] * 1001}, {"filter": {}},
         {"filter": {"order": "desc"}}, {"filter": {"state": "deleted"}},
         {"frame_ids": ["a"], "filter": {"name": "a"}}, {"filter": {"nothing": 1}},
     ],
 )  # fmt: skip
-def test_what_selects_nothing_or_everything_is_refused(given):
+def test_what_selects_nothing_or_everything_is_refused(fields):
     with pytest.raises(ValidationError):
-        FrameSelection.model_validate(given)
+        FrameSelection.model_validate(fields)
     with pytest.raises(ValidationError, match="specify session, robot, add_tags or remove_tags"):
         FramesEdit.model_validate({"frame_ids": ["a"], "add_tags": []})
 

@@ -44,11 +44,11 @@ def host(make_engine, store_url, place, tmp_path):
     (tmp_path / "common" / "blobs").mkdir(parents=True)
 
     def make(name, **more):
-        given = {
+        fields = {
             "database_url": store_url, "blob_url": f"file://{tmp_path}/common",
             "index_url": place, "unindexed_frames": 2, "undo_window_s": 0,
         }  # fmt: skip
-        return make_engine(tmp_path / name, **{**given, **more})
+        return make_engine(tmp_path / name, **{**fields, **more})
 
     return make
 
@@ -87,7 +87,7 @@ def ask(engine, uploads, which=1, name="hall"):
     return engine.queries.upload([name], uploads[which].data, uploads[which].meta, ALL)
 
 
-def found(answer):
+def matches_of(answer):
     return [(match.frame_id, match.distance) for match in answer.matches]
 
 
@@ -107,7 +107,7 @@ def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, upl
     await_fetches(other)
     second = ask(other, uploads)
     assert second.index_version == 1
-    assert found(second) == found(first) == found(ask(built, uploads))
+    assert matches_of(second) == matches_of(first) == matches_of(ask(built, uploads))
     fetched = {path.name: path.read_bytes() for path in folder_of(other).glob("[0-9a-f]*")}
     assert fetched == own
     fill(other, range(4, 8))
@@ -115,7 +115,7 @@ def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, upl
     ask(built, uploads)
     await_fetches(built)
     assert ask(built, uploads).index_version == 2
-    assert found(ask(built, uploads)) == found(ask(other, uploads))
+    assert matches_of(ask(built, uploads)) == matches_of(ask(other, uploads))
     assert ask(built, uploads).counts.map == 8
 
 
@@ -221,13 +221,13 @@ def test_queries_go_on_without_the_store_and_workers_try_again(
     make_engine, postgres_url, bucket, object_server, fill, uploads, tmp_path, monkeypatch, caplog
 ):
     (tmp_path / "common" / "blobs").mkdir(parents=True)
-    given = {
+    fields = {
         "database_url": postgres_url, "blob_url": f"file://{tmp_path}/common",
         "unindexed_frames": 2,
     }  # fmt: skip
     with monkeypatch.context() as away:
         away.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")  # where nobody listens
-        engine = make_engine(tmp_path / "one", index_url=f"{bucket}/x", **given)
+        engine = make_engine(tmp_path / "one", index_url=f"{bucket}/x", **fields)
         engine.create_map(NewMap(name="hall", model="depth"))
         names = fill(engine, range(4))
         assert engine.publish_due() == 0
@@ -237,7 +237,7 @@ def test_queries_go_on_without_the_store_and_workers_try_again(
         assert numbers(engine) == []
     output = {record.message for record in caplog.records}
     assert output >= {"index publication failed", "index not fetched"}
-    there = make_engine(tmp_path / "one", index_url=f"{bucket}/x", **given)
+    there = make_engine(tmp_path / "one", index_url=f"{bucket}/x", **fields)
     assert there.publish_due() == 1
 
 

@@ -221,10 +221,10 @@ def test_slices_that_are_lost_are_done_again(engine, monkeypatch):
     turns = []
     while (lost := engine.claim("w")) is not None:
         engine.put_back(lost)
-        taken = engine.claim("w")
-        outcome = surface_job.SurfaceHandler(engine.store, engine.signers)(taken, lambda: True)
+        job = engine.claim("w")
+        outcome = surface_job.SurfaceHandler(engine.store, engine.signers)(job, lambda: True)
         assert all(engine.store.blobs.holds(blob) for blob in outcome.blobs)
-        turns.append(engine.run(taken))
+        turns.append(engine.run(job))
     assert turns[-1] is JobState.SUCCEEDED
     assert len(turns) > 12
     assert tiles_of(engine) == before

@@ -93,11 +93,11 @@ def test_a_session_is_restored_with_names_tags_and_states(empty, uploads, monkey
     for module in (selections, tombstones):
         monkeypatch.setattr(module, "AT_ONCE", 2)
     for number, upload in enumerate(uploads[:7]):
-        known = {
+        fields = {
             "session": "a" if number < 5 else "b", "robot": "r", "tags": ["x", f"{number}"],
             "name": f"{number}.png", "sequence": number,
         }  # fmt: skip
-        meta = FrameMeta.model_validate(upload.meta.model_dump() | known)
+        meta = FrameMeta.model_validate(upload.meta.model_dump() | fields)
         empty.add_frame("hall", upload.data, meta)
     before = frames(empty)
     change = delete_session(empty.store, "hall", "a", empty.tombstones)

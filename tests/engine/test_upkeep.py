@@ -33,19 +33,19 @@ def fill(engine, uploads, which):
 
 def test_an_index_of_a_history_that_was_undone_is_not_believed(make_engine, uploads, tmp_path):
     """Put back to two frames, the database gives the numbers of the next three out again."""
-    data, kept = tmp_path / "data", tmp_path / "kept"
+    data, aside = tmp_path / "data", tmp_path / "kept"
     engine = make_engine(data, unindexed_frames=2)
     engine.create_map(NewMap(name="hall", model="depth"))
     fill(engine, uploads, range(2))
     engine.close()
-    shutil.copytree(data, kept)
+    shutil.copytree(data, aside)
     engine = make_engine(data, unindexed_frames=2)
     fill(engine, uploads, range(2, 5))
     assert engine.publish_due() == 1
     engine.close()
-    shutil.copytree(data / "index", kept / "index", dirs_exist_ok=True)
+    shutil.copytree(data / "index", aside / "index", dirs_exist_ok=True)
     shutil.rmtree(data)
-    kept.rename(data)
+    aside.rename(data)
     engine = make_engine(data, unindexed_frames=2)
     names = fill(engine, uploads, range(5, 8))
     for name, i in zip(names, range(5, 8), strict=True):
@@ -171,8 +171,8 @@ def test_what_is_deleted_while_a_query_runs_is_not_told(full, uploads, monkeypat
     names, search = full.ids(), local_index.search
     gone = [names[6], names[1]]
 
-    def then_delete(*given, **more):
-        hits = search(*given, **more)
+    def then_delete(*args, **more):
+        hits = search(*args, **more)
         if gone:
             full.delete_frame("hall", gone.pop())
         return hits
@@ -225,14 +225,14 @@ def test_what_is_deleted_while_an_index_is_published_stays_deleted(
     reader.query_frame("hall", names[0], R)
     meta = uploads[3].meta
     camera = meta.intrinsics.model_copy(update={"cx": meta.intrinsics.cx + 1})
-    given = meta.model_copy(update={"intrinsics": camera})
-    gone = full.add_frame("hall", uploads[3].data, given)[0].frame_id
+    own_meta = meta.model_copy(update={"intrinsics": camera})
+    gone = full.add_frame("hall", uploads[3].data, own_meta)[0].frame_id
     full.work_off()
 
-    def slowly(*given, **more):
+    def slowly(*args, **more):
         full.delete_frame("hall", gone)
         assert len(reader.query_frame("hall", names[0], R).matches) == 11
-        return publish(*given, **more)
+        return publish(*args, **more)
 
     monkeypatch.setattr(index_upkeep, "publish", slowly)
     assert builder.publish_due() == 1

@@ -261,13 +261,13 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "given", "place"), REFUSED)
-def test_what_would_mean_nothing_is_refused_at_its_place(kind, given, place):
+@pytest.mark.parametrize(("kind", "fields", "place"), REFUSED)
+def test_what_would_mean_nothing_is_refused_at_its_place(kind, fields, place):
     with pytest.raises(ValidationError) as caught:
-        kind.model_validate(given)
+        kind.model_validate(fields)
     assert place in [".".join(map(str, e["loc"])) for e in caught.value.errors()]
     with pytest.raises(ValidationError):
-        kind.model_validate_json(json.dumps(given))
+        kind.model_validate_json(json.dumps(fields))
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -40,7 +40,7 @@ class Room:
     @staticmethod
     def poses():
         """Return T_world_camera (4, 4) in optical axes at three places with different rotations."""
-        found = []
+        results = []
         for x, y, z, turn, pitch, roll in (
             (1.2, 1.1, 1.3, 20, 15, 5), (3.1, 2.6, 1.0, 130, -10, -8), (4.0, 0.9, 1.8, -75, 25, 90),
         ):  # fmt: skip
@@ -53,8 +53,8 @@ class Room:
             T[:3, 1] = -math.sin(c) * right + math.cos(c) * down
             T[:3, 2] = forward
             T[:3, 3] = x, y, z
-            found.append(T)
-        return found
+            results.append(T)
+        return results
 
     @staticmethod
     def distances(origin, directions):

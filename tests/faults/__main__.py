@@ -34,12 +34,12 @@ def main():
     for store in options.store or ("sqlite", "postgresql"):
         start = time.monotonic()
         trials = _enumerate(store, options)
-        found = [violation for each in trials.values() for violation in each.violations]
-        broken += len(found)
+        result = [violation for each in trials.values() for violation in each.violations]
+        broken += len(result)
         for (operation, fault), trial in trials.items():
             counts.setdefault(operation, {})[fault] = trial.calls
         lines += [f"**{store}**, {time.monotonic() - start:.0f} s:", "", *report(trials), ""]
-        lines += [*(f"* {one}" for one in found), ""] if found else []
+        lines += [*(f"* {one}" for one in result), ""] if result else []
     text = "\n".join(lines)
     sys.stdout.write(json.dumps(counts) if options.json and not broken else f"{text}\n")
     if options.page is not None:
@@ -61,15 +61,15 @@ def _enumerate(store, options):
             stack.callback(server.stop)
         enumeration = Enumeration(work / "stores", small_uploads(), server)
         progress = stack.enter_context(tqdm(total=len(operations) * len(faults), unit="run"))
-        found = {}
+        results = {}
         for operation in operations:
             for fault in faults:
                 progress.set_description(f"{store}: {operation}, {fault}")
-                found[operation, fault] = enumeration.run(
+                results[operation, fault] = enumeration.run(
                     operation, fault, first=options.first, step=options.step
                 )
                 progress.update()
-        return found
+        return results
 
 
 if __name__ == "__main__":

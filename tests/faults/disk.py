@@ -58,9 +58,9 @@ class CutDisk:
     def synced(self, descriptor):
         with self._lock:
             self.look()
-            found = os.fstat(descriptor)
-            at = self._ids.get(found.st_ino)
-            if at is not None and found.st_dev == self._root.stat().st_dev:
+            result = os.fstat(descriptor)
+            at = self._ids.get(result.st_ino)
+            if at is not None and result.st_dev == self._root.stat().st_dev:
                 self._sure[at] = self._seen[at]
 
     def _durable(self, folder, path):

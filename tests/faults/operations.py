@@ -119,8 +119,8 @@ def _delete_first(engine, store):
 
 def _first_frame(engine):
     with engine.store.database.read() as connection:
-        found = select(frames.c.id).where(frames.c.state == FrameState.INDEXED)
-        return str(connection.execute(found.order_by(frames.c.number)).scalars().first())
+        query = select(frames.c.id).where(frames.c.state == FrameState.INDEXED)
+        return str(connection.execute(query.order_by(frames.c.number)).scalars().first())
 
 
 def _purge(engine, store, say):

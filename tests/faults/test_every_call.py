@@ -33,16 +33,16 @@ def counts(*options):
 def test_kills_and_power_cuts_at_some_calls():
     operations, faults = ("upload", "signature", "publication", "deletion"), ("kill", "power cut")
     chosen = [part for fault in faults for part in ("--fault", fault)]
-    found = counts(*operations, "--store", "sqlite", *chosen, "--first", "3", "--step", "9")
-    assert found.keys() == set(operations)
-    assert min(tried[fault] for tried in found.values() for fault in faults) > 0
+    result = counts(*operations, "--store", "sqlite", *chosen, "--first", "3", "--step", "9")
+    assert result.keys() == set(operations)
+    assert min(tried[fault] for tried in result.values() for fault in faults) > 0
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("store", ["sqlite", "postgresql"])
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_every_call(operation, store):
-    found = counts(operation, "--store", store)
-    assert found.keys() == {operation}
-    assert found[operation].keys() == FAULTS.keys()
-    assert found[operation]["kill"] > 3
+    result = counts(operation, "--store", store)
+    assert result.keys() == {operation}
+    assert result[operation].keys() == FAULTS.keys()
+    assert result[operation]["kill"] > 3

@@ -54,13 +54,13 @@ def test_what_is_good_meets_no_objection():
     ],
 )  # fmt: skip
 def test_each_objection_has_its_threshold(worse, just, status, reason):
-    found = objection(replace(GOOD, **worse), P, "full")
-    assert found[0] == status
-    assert reason in found[1]
+    result = objection(replace(GOOD, **worse), P, "full")
+    assert result[0] == status
+    assert reason in result[1]
     assert objection(replace(GOOD, **just), P, "full") is None
     # the paper checks the residual only
     alone = objection(replace(GOOD, **worse), P, "paper")
-    assert (alone is not None) == ("disagree" in found[1])
+    assert (alone is not None) == ("disagree" in result[1])
 
 
 @pytest.mark.parametrize(
@@ -79,9 +79,9 @@ def test_each_objection_has_its_threshold(worse, just, status, reason):
 )  # fmt: skip
 def test_scans_are_held_to_more(worse, just, status, reason):
     scans = preset_parameters("lidar")[0].validation.acceptance
-    found = objection(replace(GOOD, **worse), scans, "full")
-    assert found[0] == status
-    assert reason in found[1]
+    result = objection(replace(GOOD, **worse), scans, "full")
+    assert result[0] == status
+    assert reason in result[1]
     assert objection(replace(GOOD, **just), scans, "full") is None
     # of depth images the last two decide nothing
     assert (objection(replace(GOOD, **worse), P, "full") is None) == (
@@ -95,8 +95,8 @@ def test_scans_may_share_little_but_not_against_free_space():
     assert objection(little, scans, "full") is None
     assert belief(little, 0.0, scans)[:2] == ("accepted", "strong")
     assert belief(replace(little, plane_overlap=0.14), 0.0, scans)[:2] == ("accepted", "weak")
-    found = objection(replace(little, violations=0.025), scans, "full")
-    assert found == (
+    result = objection(replace(little, violations=0.025), scans, "full")
+    assert result == (
         "rejected",
         "the plane overlap is 16%, but 2.5% of the points lie where the other frame saw free space",
     )
@@ -172,8 +172,8 @@ def test_little_evidence_must_fix_the_transform():
 
 def test_one_direction_alone_is_not_believed():
     alone = replace(GOOD, residual_m=math.inf, residual_rad=math.inf)
-    found = objection(alone, P, "full")
-    assert found == ("rejected", "only one of the two directions found a transform")
+    result = objection(alone, P, "full")
+    assert result == ("rejected", "only one of the two directions found a transform")
 
 
 @pytest.mark.parametrize(

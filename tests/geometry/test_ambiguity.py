@@ -50,15 +50,15 @@ def turns(transforms):
 
 
 def test_quarter_turns_about_the_middle_of_each_plane():
-    found = symmetries(ROOM, P)
-    sizes = np.linalg.norm(turns(found), axis=1)
+    transforms = symmetries(ROOM, P)
+    sizes = np.linalg.norm(turns(transforms), axis=1)
     # of the floor and of the wall, which are the two main directions; of the third none
     np.testing.assert_allclose(np.sort(sizes), [90, 90, 90, 90, 180, 180], atol=1e-9)
-    axes = np.abs(turns(found)) / sizes[:, None]
+    axes = np.abs(turns(transforms)) / sizes[:, None]
     assert sorted(axes.argmax(axis=1).tolist()) == [1, 1, 1, 2, 2, 2]
     middle = ROOM.means[:40].mean(axis=0)
     about_floor = [
-        T for T in found if np.linalg.norm(transform_points(T, middle[None]) - middle) < 1e-9
+        T for T in transforms if np.linalg.norm(transform_points(T, middle[None]) - middle) < 1e-9
     ]
     assert len(about_floor) == 3
     # the three of a plane are powers of the first
@@ -68,8 +68,8 @@ def test_quarter_turns_about_the_middle_of_each_plane():
 
 
 def test_shifts_along_both_main_planes_go_both_ways():
-    found = symmetries(ROOM, P)  # a floor across y and a wall across z: a corridor along x
-    shifts = np.array([T[:3, 3] for T in found if np.allclose(T[:3, :3], np.eye(3))])
+    transforms = symmetries(ROOM, P)  # a floor across y and a wall across z: a corridor along x
+    shifts = np.array([T[:3, 3] for T in transforms if np.allclose(T[:3, :3], np.eye(3))])
     np.testing.assert_allclose(shifts[:, 1:], 0.0, atol=1e-12)
     steps = P.shift * np.arange(1, P.n_shifts + 1)
     np.testing.assert_allclose(np.sort(shifts[:, 0]), [*-steps[::-1], *steps], atol=1e-12)
@@ -80,12 +80,12 @@ def test_planes_and_directions_are_taken_by_area():
     assert len(turns(symmetries(one, P))) == 3
     # four steps of a stair, facing up or down: one direction, of which the largest three count
     stair = on_planes(*(([0, s, 0], 0.3 * k, 10 - k, 0.1) for k, s in enumerate((1, -1, 1, -1))))
-    found = symmetries(stair, P)
-    assert len(turns(found)) == 9
+    result = symmetries(stair, P)
+    assert len(turns(result)) == 9
     for k, start, n, count in ((0, 0, 10, 3), (1, 10, 9, 3), (2, 19, 8, 3), (3, 27, 7, 0)):
         middle = stair.means[start : start + n].mean(axis=0)
         assert abs(middle[1]) == pytest.approx(0.3 * k)
-        held = [np.linalg.norm(transform_points(T, middle[None]) - middle) < 1e-9 for T in found]
+        held = [np.linalg.norm(transform_points(T, middle[None]) - middle) < 1e-9 for T in result]
         assert sum(held) == count
     blank = on_planes(([0, -1, 0], -1.0, 10, 0.0))
     assert symmetries(blank, P).shape == (0, 4, 4)

@@ -39,22 +39,22 @@ def test_points_go_to_their_cells():
             [np.nan, 0.0, 0.0], [1e300, 0.0, 0.0],
         ]
     )  # fmt: skip
-    found = view_cells(points, CELL_M, ViewStamp(7, 5.0, 2))
-    assert set(found) == {(0, 0, 0), (-1, 0, 0), (1, 0, 0)}
-    (first,) = found[0, 0, 0]
+    result = view_cells(points, CELL_M, ViewStamp(7, 5.0, 2))
+    assert set(result) == {(0, 0, 0), (-1, 0, 0), (1, 0, 0)}
+    (first,) = result[0, 0, 0]
     assert (first["key"], first["views"], first["number"], first["session"]) == (0, 1, 7, 2)
     # in 256ths of a cell: (51 + 153) // 2, 102, 153
     np.testing.assert_array_equal(first["sums"], [102, 102, 153])
-    assert found[-1, 0, 0]["key"].tolist() == [63]
-    assert found[1, 0, 0]["key"].tolist() == [63 * 64**2]
+    assert result[-1, 0, 0]["key"].tolist() == [63]
+    assert result[1, 0, 0]["key"].tolist() == [63 * 64**2]
 
 
 def test_a_view_of_points_all_over_fills_few_tiles():
     far = (np.arange(2000.0)[:, None] + 0.5) * [TILE_M, 0.0, 0.0]
     twice = far[700:800] + np.array([0.0, 0.1, 0.0])
-    found = view_cells(np.concatenate([far, twice]), CELL_M, ViewStamp(1, 0.0, 0))
-    assert len(found) == MOST_TILES
-    assert sum(len(rows) for rows in found.values()) == MOST_TILES + 100  # the fullest are kept
+    result = view_cells(np.concatenate([far, twice]), CELL_M, ViewStamp(1, 0.0, 0))
+    assert len(result) == MOST_TILES
+    assert sum(len(rows) for rows in result.values()) == MOST_TILES + 100  # the fullest are kept
 
 
 def test_views_fuse_in_any_order():
@@ -103,17 +103,17 @@ def test_the_next_level_by_hand():
         ]
     )  # fmt: skip
     fine = encode_cells(rows, TimeScale(0.0, 1.0))
-    found = coarsen_cells({(5, 0, 0): fine})  # the second quarter of its tile
+    result = coarsen_cells({(5, 0, 0): fine})  # the second quarter of its tile
     # places 0 and 12 of 256 in the tile are 64 and 67 of the next level's; 18 is 68
-    assert found["at"].tolist() == [[65, 0, 0], [68, 0, 0]]
-    assert found["seen"].tolist() == [32, 48]
-    assert found["session"].tolist() == [2, 3]
-    assert found["taken"].tolist() == [60, NO_TIME]
-    assert len(remove_tile(found, (5, 0, 0))) == 0
-    assert remove_tile(found, (6, 0, 0)).tobytes() == found.tobytes()
+    assert result["at"].tolist() == [[65, 0, 0], [68, 0, 0]]
+    assert result["seen"].tolist() == [32, 48]
+    assert result["session"].tolist() == [2, 3]
+    assert result["taken"].tolist() == [60, NO_TIME]
+    assert len(remove_tile(result, (5, 0, 0))) == 0
+    assert remove_tile(result, (6, 0, 0)).tobytes() == result.tobytes()
     other = coarsen_cells({(4, 0, 0): fine})
     both = coarsen_cells({(4, 0, 0): fine, (5, 0, 0): fine})
-    assert merge_cells(found, other).tobytes() == both.tobytes()
+    assert merge_cells(result, other).tobytes() == both.tobytes()
     assert merge_cells(remove_tile(both, (4, 0, 0)), other).tobytes() == both.tobytes()
 
 

@@ -49,8 +49,8 @@ def test_accepted_matches_count_by_the_frames_that_see_the_place():
 def test_candidates_share_what_one_of_them_has():
     """Odds of e^6 and e^5 against 1 that none is right."""
     whole = 1 + math.exp(6.0) + math.exp(5.0)
-    found = compute_confidences([BEST, replace(BEST, planes=12.0)], JUDGEMENT)
-    assert found == pytest.approx([math.exp(6.0) / whole, math.exp(5.0) / whole])
+    result = compute_confidences([BEST, replace(BEST, planes=12.0)], JUDGEMENT)
+    assert result == pytest.approx([math.exp(6.0) / whole, math.exp(5.0) / whole])
     assert compute_confidences([], JUDGEMENT) == []
 
 
@@ -61,8 +61,8 @@ def test_better_evidence_never_lowers_a_confidence(name):
     # five frames or more see the place, and each accepted match is a fifth
     field, times = ("accepted", 5.0) if name == "acceptance" else (name, 1.0)
     tried = [replace(BEST, **{field: times * x}) for x in steps]
-    found = [compute_confidences([e], ConfidenceModel())[0] for e in tried]
-    assert found == sorted(found)
+    result = [compute_confidences([e], ConfidenceModel())[0] for e in tried]
+    assert result == sorted(result)
 
 
 def test_rendered_views_have_numbers_of_their_own():

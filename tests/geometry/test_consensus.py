@@ -118,9 +118,9 @@ def test_the_motion_is_found_among_outliers(share):
         a = scenes.random_patches(rng, 150)
         T = rigid(rng, 3)
         b, pairs = carried(a, T), with_outliers(rng, 150, share)
-        found = consensus(a, b, pairs, P)
-        assert 1 <= len(found) <= P.n_seeds
-        np.testing.assert_allclose(found[0], T, atol=1e-6)
+        result = consensus(a, b, pairs, P)
+        assert 1 <= len(result) <= P.n_seeds
+        np.testing.assert_allclose(result[0], T, atol=1e-6)
 
 
 def test_too_few_correspondences():
@@ -129,8 +129,8 @@ def test_too_few_correspondences():
     pairs = with_outliers(np.random.default_rng(8), 20, 0.0)
     for n in (0, 1, 2):
         assert consensus(a, carried(a, T), pairs[:n], P).shape == (0, 4, 4)
-    found = consensus(a, carried(a, T), pairs[:3], P)
-    assert len(found) >= 1
-    np.testing.assert_allclose(found[0], T, atol=1e-9)
+    result = consensus(a, carried(a, T), pairs[:3], P)
+    assert len(result) >= 1
+    np.testing.assert_allclose(result[0], T, atol=1e-9)
     # one patch again and again: nothing is far enough from it
     assert consensus(a, a, np.zeros((30, 2), np.int32), P).shape == (0, 4, 4)

@@ -58,9 +58,9 @@ def test_transport_against_monte_carlo():
     some = [with_error(T, error) for error in errors]
     for pose_of, expected in cases:
         there = pose_of(T)
-        found = np.cov(np.array([pose_error(there, pose_of(one)) for one in some]).T)
+        result = np.cov(np.array([pose_error(there, pose_of(one)) for one in some]).T)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-        np.testing.assert_allclose(found / scale, expected / scale, atol=0.06)
+        np.testing.assert_allclose(result / scale, expected / scale, atol=0.06)
 
 
 def left_twist(T, true):
@@ -90,9 +90,9 @@ def test_a_pairs_covariance_from_the_definition(lost):
         noise.append(one.mean_square)
     expected = np.linalg.inv(information / len(noise)) * np.mean(noise) / p.independent
     there, back = (None if i == lost else one for i, one in enumerate(refined))
-    found = pair_covariance(there, back, T)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
-    assert (found == found.T).all()
+    result = pair_covariance(there, back, T)
+    np.testing.assert_allclose(result, expected, rtol=1e-5, atol=1e-12)
+    assert (result == result.T).all()
     # a radian may count as any number of metres: that only says what is free
     other = pair_covariance(there, back, T, replace(p, lever=3.0))
     np.testing.assert_allclose(other, expected, rtol=1e-5, atol=1e-12)
@@ -127,15 +127,15 @@ def test_a_place_from_its_votes():
     covariances = np.array([np.diag([s] * 6) for s in (4e-4, 4e-4, 4e-4, 7.0)])
     average = average_poses(poses)
     assert average.members.tolist() == [0, 1, 2]
-    fused, found = fuse_votes(average, poses, covariances, np.ones(4))
+    fused, result = fuse_votes(average, poses, covariances, np.ones(4))
     np.testing.assert_allclose(fused.T, average.T, atol=1e-12)
     expected = np.diag([4e-4 * (1 / 2 + 1 / 6)] * 6)
     expected[0, 0] += 2 * 0.01**2 / (3 * 2)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(result, expected, atol=1e-12)
     alone = average_poses(poses[3:])
-    fused, found = fuse_votes(alone, poses[3:], covariances[3:], np.ones(1))
+    fused, result = fuse_votes(alone, poses[3:], covariances[3:], np.ones(1))
     np.testing.assert_allclose(fused.T, poses[3], atol=1e-12)
-    np.testing.assert_allclose(found, covariances[3], atol=1e-12)
+    np.testing.assert_allclose(result, covariances[3], atol=1e-12)
 
 
 def test_votes_are_weighted_by_their_information():
@@ -143,13 +143,13 @@ def test_votes_are_weighted_by_their_information():
     poses[1, :3, 3] = (0.03, 0.03, 0.0)
     covariances = np.array([np.diag([1e-4, 4e-4, 1e-4] * 2), np.diag([2e-4, 2e-4, 1e-4] * 2)])
     average = average_poses(poses)
-    fused, found = fuse_votes(average, poses, covariances, np.ones(2))
+    fused, result = fuse_votes(average, poses, covariances, np.ones(2))
     # x: 2 parts of the first, 1 of the second; y: 1 part of the first, 2 of the second
     np.testing.assert_allclose(fused.T[:3, 3], (0.01, 0.02, 0.0), atol=1e-12)
     # both are sqrt(5) cm away from it, in x and y
     assert fused.spread_m == pytest.approx(0.01 * math.sqrt(5))
     own, shared = (4 * 1e-4 + 2e-4) / 9, ((2 * 1e-2 + math.sqrt(2) * 1e-2) / 3) ** 2
     spread = 2 * ((2 / 3 * 0.01) ** 2 + (1 / 3 * 0.02) ** 2)
-    assert found[0, 0] == pytest.approx((own + shared) / 2 + spread)
+    assert result[0, 0] == pytest.approx((own + shared) / 2 + spread)
     inflated, _ = fuse_votes(average, poses, covariances, np.array([1.0, 2.0]))
     np.testing.assert_allclose(inflated.T[:2, 3], (0.03 / 5, 0.03 / 2), atol=1e-12)

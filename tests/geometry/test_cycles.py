@@ -32,7 +32,7 @@ def edges_between(rng, here, there, n, metres, degrees):
 
 def oracle(edges, source, target, p):
     """Pairs of edges near each other, and which close: one after the other, in matrices."""
-    found = {}
+    results = {}
     for e in range(len(edges)):
         for f in range(e + 1, len(edges)):
             i, j, k, m = edges.source[e], edges.target[e], edges.source[f], edges.target[f]
@@ -52,10 +52,10 @@ def oracle(edges, source, target, p):
             metres, radians = pose_difference(over, edges.transforms[f])
             back = inverse(target.poses[j]) @ target.poses[m] @ edges.transforms[f] @ inverse(along)
             metres = max(metres, pose_difference(back, edges.transforms[e])[0])
-            found[e, f] = metres <= p.close_m + p.drift * sum(
+            results[e, f] = metres <= p.close_m + p.drift * sum(
                 ways
             ) and radians <= p.close_rad + p.drift * sum(turns)
-    return found
+    return results
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -67,24 +67,24 @@ def test_loops_are_those_of_the_oracle(seed):
     expected = oracle(edges, source, target, p)
     assert any(expected.values())
     assert not all(expected.values())
-    found = judge_edges(edges, source, target)
-    kept = np.ones(len(edges), bool)
+    verdicts = judge_edges(edges, source, target)
+    mask = np.ones(len(edges), bool)
     while True:  # the most outvoted first
         against = np.zeros(len(edges))
         for (e, f), closes in expected.items():
-            if kept[e] and kept[f]:
+            if mask[e] and mask[f]:
                 sign = -1.0 if closes else 1.0
                 against[e] += sign * edges.weights[f]
                 against[f] += sign * edges.weights[e]
-        against[~kept] = 0.0
+        against[~mask] = 0.0
         if against.max() <= 0:
             break
-        kept[int(np.argmax(against))] = False
-    np.testing.assert_array_equal(found.accepted, kept)
+        mask[int(np.argmax(against))] = False
+    np.testing.assert_array_equal(verdicts.accepted, mask)
     for e in range(len(edges)):
         own = [closes for pair, closes in expected.items()
-               if e in pair and kept[pair[0] if pair[1] == e else pair[1]]]  # fmt: skip
-        assert (found.loops[e], found.closed[e]) == (len(own), sum(own))
+               if e in pair and mask[pair[0] if pair[1] == e else pair[1]]]  # fmt: skip
+        assert (verdicts.loops[e], verdicts.closed[e]) == (len(own), sum(own))
 
 
 def test_by_hand():
@@ -117,7 +117,7 @@ def test_an_edge_of_the_same_viewpoint_supports_nothing():
     """Frames at 0 and 5 cm are one viewpoint, that at 20 cm is another one; all edges agree."""
     here = line(0.0, 0.05, 0.2)
 
-    def found(chosen, target, there):
+    def accepted_edges(chosen, target, there):
         source, onto = np.array(chosen), np.array(target)
         transforms = inverses(there[onto]) @ here[source]
         edges = LoopEdges(source, onto, transforms, np.ones(len(source)))
@@ -127,15 +127,15 @@ def test_an_edge_of_the_same_viewpoint_supports_nothing():
         return judged.supported.tolist()
 
     still = line(0.0, 0.01, 0.02)
-    assert found([0, 1], [0, 1], still) == [False, False]
-    assert found([0, 1, 2], [0, 1, 2], still) == [True, True, True]
+    assert accepted_edges([0, 1], [0, 1], still) == [False, False]
+    assert accepted_edges([0, 1, 2], [0, 1, 2], still) == [True, True, True]
     # on either run: one frame that was found at two places of the other one
-    assert found([0, 0], [0, 2], here) == [True, True]
-    assert found([0], [0], here) == [False]
+    assert accepted_edges([0, 0], [0, 2], here) == [True, True]
+    assert accepted_edges([0], [0], here) == [False]
     # or turned by 7 degrees where it stood
     turned = still.copy()
     turned[1, :3, :3] = Rotation.from_euler("y", 7.0, degrees=True).as_matrix()
-    assert found([0, 1], [0, 1], turned) == [True, True]
+    assert accepted_edges([0, 1], [0, 1], turned) == [True, True]
 
 
 def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other():
@@ -147,9 +147,9 @@ def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other():
     source, run = np.arange(20, 40), a_run(poses)
     alike = LoopEdges(source, source - 20, np.tile(np.eye(4), (20, 1, 1)), np.ones(20))
     # all edges are turned alike, so that they agree with each other and with nothing else
-    found = judge_edges(alike, run, run)
-    assert found.accepted.all()
-    assert found.supported.all()
+    verdicts = judge_edges(alike, run, run)
+    assert verdicts.accepted.all()
+    assert verdicts.supported.all()
     within = judge_edges(alike, run, run, within_run=True)
     assert within.accepted.all()
     assert not within.supported.any()
@@ -159,8 +159,8 @@ def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other():
         transforms = true.copy()
         transforms[:, 2, 3] += metres
         edges = LoopEdges(source, source - 20, transforms, np.ones(20))
-        found = judge_edges(edges, run, run, within_run=True)
-        assert found.supported.tolist() == [supported] * 20
+        verdicts = judge_edges(edges, run, run, within_run=True)
+        assert verdicts.supported.tolist() == [supported] * 20
     # a gap in the odometry allows everything
     gap = a_run(poses, [0] * 20 + [1] * 20)
     assert judge_edges(alike, gap, gap, within_run=True).supported.all()
@@ -180,11 +180,11 @@ def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken():
     edges = LoopEdges(every, every, transforms, np.ones(4))
     lost = poses.copy()
     lost[1] = np.nan
-    found = judge_edges(edges, a_run(lost), a_run(poses))
-    assert found.loops.tolist() == [2, 0, 2, 2]
-    assert found.accepted.all()
-    found = judge_edges(edges, a_run(poses, [0, 0, 1, 1]), a_run(poses))
-    assert found.loops.tolist() == [1, 1, 1, 1]
+    verdicts = judge_edges(edges, a_run(lost), a_run(poses))
+    assert verdicts.loops.tolist() == [2, 0, 2, 2]
+    assert verdicts.accepted.all()
+    verdicts = judge_edges(edges, a_run(poses, [0, 0, 1, 1]), a_run(poses))
+    assert verdicts.loops.tolist() == [1, 1, 1, 1]
 
 
 def test_the_reach_is_shortened_rather_than_memory_taken():

@@ -38,25 +38,25 @@ def naive_greedy(to_query, among, k, p):
 
 def test_kernel_by_hand():
     # rho = exp(-0.5 * (2, 4) / 4) = exp(-1/4), exp(-1/2); exp(-6 / 3) between the two
-    found = kernel_matrix(np.array([2.0, 4.0]), np.array([[0, 6.0], [6.0, 0]]), 3.0, 4.0)
+    result = kernel_matrix(np.array([2.0, 4.0]), np.array([[0, 6.0], [6.0, 0]]), 3.0, 4.0)
     expected = np.exp([[-0.5, -2.75], [-2.75, -1.0]])
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_allclose(result, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("p", [DiversityParameters(), DiversityParameters(0.3, 0.5)])
 def test_greedy_equals_the_determinants(seed, p):
     to_query, among = ranking(seed, 25)
-    found = diversify(to_query, among, 6, p)
+    selection = diversify(to_query, among, 6, p)
     indices, gains = zip(*naive_greedy(to_query, among, 6, p), strict=True)
-    assert found.indices.tolist() == list(indices)
-    np.testing.assert_allclose(found.gains, gains, rtol=1e-9)
+    assert selection.indices.tolist() == list(indices)
+    np.testing.assert_allclose(selection.gains, gains, rtol=1e-9)
 
 
 def test_exact_duplicates_are_never_taken_twice():
     position = np.array([0.0, 0.0, 0.0, 5.0, 5.0, 9.0])
-    found = diversify(np.arange(6.0), np.abs(position[:, None] - position[None]), 6)
-    assert position[found.indices].tolist() == [0.0, 5.0, 9.0]
+    selection = diversify(np.arange(6.0), np.abs(position[:, None] - position[None]), 6)
+    assert position[selection.indices].tolist() == [0.0, 5.0, 9.0]
     same = diversify(np.full(4, 7.0), np.zeros((4, 4)), 3)
     assert same.indices.tolist() == [0]
 
@@ -73,12 +73,12 @@ def test_empty_and_wrong_input():
 def test_what_is_left_is_what_a_determinant_would_gain(k):
     to_query, among = ranking(11, 15)
     p = DiversityParameters(sigma=0.8)
-    taken = diversify(to_query, among, k, p).indices
-    found = remaining_gains(among, taken, p)
+    selection = diversify(to_query, among, k, p).indices
+    result = remaining_gains(among, selection, p)
     likeness = np.exp(-among / (0.8 * np.median(among[np.triu_indices(15, 1)])))
     for i in range(15):
-        both = [*taken.tolist(), i]
+        both = [*selection.tolist(), i]
         whole = np.linalg.det(likeness[np.ix_(both, both)])
-        gain = whole / np.linalg.det(likeness[np.ix_(taken, taken)])
-        assert found[i] == (0.0 if i in taken else pytest.approx(gain, abs=1e-9))
-    assert len(set(found.tolist())) == 15 - k + 1
+        gain = whole / np.linalg.det(likeness[np.ix_(selection, selection)])
+        assert result[i] == (0.0 if i in selection else pytest.approx(gain, abs=1e-9))
+    assert len(set(result.tolist())) == 15 - k + 1

@@ -85,15 +85,15 @@ def test_statistics_of_counts_equal_those_of_the_pairs():
     assert posteriors(bins, wide).min() > 2e-3
     counts = rng.integers(0, 4, 40).astype(np.int32)
     n = int(counts.sum())
-    found = statistics_of_counts(counted(counts), table_of(bins, wide), 5)
+    result = statistics_of_counts(counted(counts), table_of(bins, wide), 5)
     exact = statistics_of_features(np.repeat(bins, counts, axis=0), np.ones(n), wide)
-    assert found.n_pairs == exact.n_pairs == found.total == exact.total == n
+    assert result.n_pairs == exact.n_pairs == result.total == exact.total == n
     weighted = statistics_of_features(bins, counts.astype(float), wide)
     np.testing.assert_allclose(weighted.second, exact.second, rtol=1e-12, atol=1e-12)
     assert (weighted.n_pairs, weighted.total) == (40, n)
-    for a, b in ((found.zeroth, exact.zeroth), (found.first, exact.first)):
+    for a, b in ((result.zeroth, exact.zeroth), (result.first, exact.first)):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(found.second, exact.second, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(result.second, exact.second, rtol=1e-5, atol=1e-5)
 
 
 def test_quantise_by_hand():

@@ -74,8 +74,8 @@ def test_tilts_by_hand():
     turns = np.tile(np.eye(4), (4, 1, 1))
     for i, (axis, degrees) in enumerate((("z", 70), ("x", 90), ("y", -20), ("x", 180))):
         turns[i, :3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-    found = np.degrees(tilts(turns, (Z, Z)))
-    np.testing.assert_allclose(found, [0, 90, 20, 180], atol=1e-9)
+    result = np.degrees(tilts(turns, (Z, Z)))
+    np.testing.assert_allclose(result, [0, 90, 20, 180], atol=1e-9)
     assert are_level(turns, (Z, Z), math.radians(21)).tolist() == [True, False, True, False]
     for unknown in (NO_UPS, (Z, None), (None, Z)):
         assert are_level(turns, unknown, 0.0).all()
@@ -95,14 +95,14 @@ def test_correspondences_stand_at_one_angle_to_up():
     wide = SlopeGate(angles[0], angles[1], math.pi)
     assert (correspondences(source, target, np.random.default_rng(0), p, wide) == free).all()
     gate = SlopeGate(angles[0], angles[1], P.gate)
-    found = correspondences(source, target, np.random.default_rng(0), p, gate)
-    assert len(found) <= 90
-    assert (np.abs(angles[0][found[:, 0]] - angles[1][found[:, 1]]) <= P.gate).all()
+    pairs = correspondences(source, target, np.random.default_rng(0), p, gate)
+    assert len(pairs) <= 90
+    assert (np.abs(angles[0][pairs[:, 0]] - angles[1][pairs[:, 1]]) <= P.gate).all()
     for patch in range(30):  # the nearest of those that may correspond, by hand
         may = np.flatnonzero(np.abs(angles[0][patch] - angles[1]) <= P.gate)
         squares = ((source[patch].astype(int) - target[may].astype(int)) ** 2).sum(axis=1)
         nearest = may[np.argsort(squares, kind="stable")[:3]]
-        assert found[found[:, 0] == patch, 1].tolist() == nearest.tolist()
+        assert pairs[pairs[:, 0] == patch, 1].tolist() == nearest.tolist()
     none = SlopeGate(np.zeros(30), np.full(40, 1.0), P.gate)
     assert correspondences(source, target, np.random.default_rng(0), p, none).shape == (0, 2)
 
@@ -205,20 +205,20 @@ def test_a_rival_that_tilts_is_dropped(model):
     assert level.ambiguity < without.ambiguity - 0.2
     view = [plane_view(one, AmbiguityParameters().planes) for one in (query, match)]
     none = np.empty((0, 4, 4))
-    found = best_alternative(
+    result = best_alternative(
         view[0], view[1], np.eye(4), 0.0, without.T_rival[None], none, AmbiguityParameters(),
         OverlapParameters(), ups, P.rival_tilt,
     )  # fmt: skip
-    assert found.tilted >= without.ambiguity - 0.01  # told apart, so that a wrong `up` is noticed
+    assert result.tilted >= without.ambiguity - 0.01  # told apart, so that a wrong `up` is noticed
 
 
 def test_the_mean_of_directions_is_that_of_the_many():
     rng, within = np.random.default_rng(8), math.radians(10)
     near = np.array([leaning(Z, 2, rng) for _ in range(5)])
     far = np.array([leaning(Z, 60, rng) for _ in range(3)])
-    found = mean_direction(np.concatenate([far, near]), within)
-    assert np.linalg.norm(found) == pytest.approx(1)
-    assert math.degrees(math.acos(found @ Z)) < 2
+    result = mean_direction(np.concatenate([far, near]), within)
+    assert np.linalg.norm(result) == pytest.approx(1)
+    assert math.degrees(math.acos(result @ Z)) < 2
     assert mean_direction(np.array([Z, [1.0, 0, 0]]), within) is None  # one against one
     alone = mean_direction(Z[None], within)
     assert alone.tolist() == Z.tolist()

@@ -40,14 +40,14 @@ def test_a_known_transform_among_as_many_outliers(seed):
     rng = np.random.default_rng(seed)
     true = rigid(rng, 10.0)
     votes = seen(rng, true, 30, 30)
-    found = join_sessions(votes, seed)
-    assert (found.support, found.strength) == (30, "strong")
-    assert at_places(votes, found.T, true) < 0.02
-    assert pose_difference(found.T, true)[1] < math.radians(0.4)
-    left = [pose_difference(found.T @ place_of(p), T @ place_of(p))[0]
+    join = join_sessions(votes, seed)
+    assert (join.support, join.strength) == (30, "strong")
+    assert at_places(votes, join.T, true) < 0.02
+    assert pose_difference(join.T, true)[1] < math.radians(0.4)
+    left = [pose_difference(join.T @ place_of(p), T @ place_of(p))[0]
             for T, p in zip(votes.transforms, votes.places, strict=True)]  # fmt: skip
-    inside = np.array(left)[found.agree]
-    assert found.spread_m == pytest.approx(math.sqrt((inside**2).mean()))
+    inside = np.array(left)[join.agree]
+    assert join.spread_m == pytest.approx(math.sqrt((inside**2).mean()))
 
 
 def place_of(point):
@@ -62,9 +62,9 @@ def test_two_answers_with_as_many_votes_are_none():
     first, second = rigid(rng, 3.0), rigid(rng, 3.0)
     a = np.array([(first if i % 2 else second) @ pose for i, pose in enumerate(b)])
     n, T = np.arange(20), np.tile(np.eye(4), (20, 1, 1))
-    found = join_sessions(association_votes(T, b, a, n, n, np.ones(20)))
-    assert (found.T, found.strength, found.support, found.rival) == (None, None, 10, 10)
-    assert "another transform" in found.reason
+    join = join_sessions(association_votes(T, b, a, n, n, np.ones(20)))
+    assert (join.T, join.strength, join.support, join.rival) == (None, None, 10, 10)
+    assert "another transform" in join.reason
     # of which one has half as much again, and a third of it: then it is believed
     weights = np.where(n % 2, 1.0, 0.45)
     assert join_sessions(association_votes(T, b, a, n, n, weights)).T is not None
@@ -102,10 +102,10 @@ def test_many_frames_of_one_place_join_nothing():
                 "within 0.00 m": "weak"}  # fmt: skip
     for said, b in reaching.items():
         T = np.array([rigid(rng, 0.01, 0.4) for _ in range(30)])
-        found = join_sessions(association_votes(T, b, true @ b, n, n, np.ones(30)))
-        assert (found.support, found.strength) == (30, expected[said])
-        assert said in found.reason
-        assert (found.T is None) is (expected[said] is None)
+        join = join_sessions(association_votes(T, b, true @ b, n, n, np.ones(30)))
+        assert (join.support, join.strength) == (30, expected[said])
+        assert said in join.reason
+        assert (join.T is None) is (expected[said] is None)
 
 
 def turned_by(degrees):
@@ -121,12 +121,12 @@ def test_a_frame_that_was_found_often_counts_once():
     source = np.array([*range(8), *([8] * 6), *([9] * 6)])
     b = b[source]
     a = np.where((source < 8)[:, None, None], true @ b, wrong @ b)
-    found = join_sessions(
+    join = join_sessions(
         association_votes(np.tile(np.eye(4), (20, 1, 1)), b, a, source, np.arange(20), np.ones(20))
     )
-    assert found.support == 8
-    assert found.T is not None
-    np.testing.assert_allclose(found.T, true, atol=1e-9)
+    assert join.support == 8
+    assert join.T is not None
+    np.testing.assert_allclose(join.T, true, atol=1e-9)
 
 
 def test_many_votes_are_tried_by_lot_and_the_same_lot_again():
@@ -134,7 +134,7 @@ def test_many_votes_are_tried_by_lot_and_the_same_lot_again():
     true = rigid(rng, 5.0)
     votes = seen(rng, true, 400, 400)
     p = JoiningParameters(hypotheses=20)
-    found = join_sessions(votes, 7, p)
-    assert found.T is not None
-    assert found.support >= 395
-    np.testing.assert_array_equal(found.T, join_sessions(votes, 7, p).T)
+    join = join_sessions(votes, 7, p)
+    assert join.T is not None
+    assert join.support >= 395
+    np.testing.assert_array_equal(join.T, join_sessions(votes, 7, p).T)

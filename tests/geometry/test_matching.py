@@ -22,19 +22,19 @@ def test_equals_the_oracle(levels):
     for length in (1, 4, 128):
         source = rng.integers(0, levels, (40, length), np.uint8) * (255 // (levels - 1))
         target = rng.integers(0, levels, (70, length), np.uint8) * (255 // (levels - 1))
-        found = correspondences(source, target, rng, MatchingParameters(25, 4))
-        assert (found.shape, found.dtype) == ((100, 2), np.int32)
-        drawn = found[::4, 0]
+        pairs = correspondences(source, target, rng, MatchingParameters(25, 4))
+        assert (pairs.shape, pairs.dtype) == ((100, 2), np.int32)
+        drawn = pairs[::4, 0]
         assert (np.diff(drawn) > 0).all()
-        assert found.tolist() == oracle(source, target, drawn, 4)
+        assert pairs.tolist() == oracle(source, target, drawn, 4)
 
 
 def test_distances_do_not_wrap():
     # 1024 bytes, each 255 apart: the largest there is; 200 apart would be nearer modulo 2^16
     source = np.zeros((1, 1024), np.uint8)
     target = np.array([[255] * 1024, [200] * 1024, [201] * 1024, [1] * 1024], np.uint8)
-    found = correspondences(source, target, np.random.default_rng(0), MatchingParameters(1, 4))
-    assert found[:, 1].tolist() == [3, 1, 2, 0]
+    pairs = correspondences(source, target, np.random.default_rng(0), MatchingParameters(1, 4))
+    assert pairs[:, 1].tolist() == [3, 1, 2, 0]
 
 
 def test_each_source_is_drawn_once_at_random():
@@ -53,8 +53,8 @@ def test_each_source_is_drawn_once_at_random():
 def test_fewer_patches_than_wanted():
     rng = np.random.default_rng(4)
     source, target = rng.integers(0, 256, (5, 8), np.uint8), rng.integers(0, 256, (2, 8), np.uint8)
-    found = correspondences(source, target, rng, MatchingParameters(100, 3))
-    assert found.tolist() == oracle(source, target, np.arange(5, dtype=np.int32), 2)
+    pairs = correspondences(source, target, rng, MatchingParameters(100, 3))
+    assert pairs.tolist() == oracle(source, target, np.arange(5, dtype=np.int32), 2)
     none = np.empty((0, 8), np.uint8)
     assert correspondences(none, target, rng, MatchingParameters()).shape == (0, 2)
     assert correspondences(source, none, rng, MatchingParameters()).shape == (0, 2)

@@ -66,9 +66,9 @@ def test_least_axis_is_the_eigenvector_of_the_least(seed):
     half = np.random.default_rng(seed).normal(size=(3, 3)) * [1.0, 0.3, 1e-3]
     m = half @ half.T
     values, vectors = np.linalg.eigh(m)
-    found, axis = np.zeros(3), np.zeros(3)
-    least_axis(m.copy(), found, axis)
-    np.testing.assert_allclose(np.sort(found), values, atol=1e-12)
+    result, axis = np.zeros(3), np.zeros(3)
+    least_axis(m.copy(), result, axis)
+    np.testing.assert_allclose(np.sort(result), values, atol=1e-12)
     assert abs(axis @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-9)
 
 
@@ -79,8 +79,8 @@ def test_facing_normals_are_numpys_components():
     normals, at = np.zeros_like(places), places.copy()
     limits = np.array([5.0, 1e-9])
     fit_planes(places, links.offsets, links.indices, 10.0, limits, normals, at)
-    for i, found in enumerate(of(links)):
-        group = places[sorted({i, *found})]
+    for i, result in enumerate(of(links)):
+        group = places[sorted({i, *result})]
         if len(group) < 5:
             assert not normals[i].any()
             continue
@@ -104,5 +104,5 @@ def test_seen_planes_are_exact_beside_a_step():
     fit_inverse_planes(q, rays, links.offsets, links.indices, gates, limits, planes)
     inner = np.abs(z) < 0.9
     for side, a in ((y < 0, left), (y > 0, right)):
-        found = planes[side & inner & (np.abs(y) < 0.9)]
-        np.testing.assert_allclose(found, np.broadcast_to(a, found.shape), atol=1e-9)
+        result = planes[side & inner & (np.abs(y) < 0.9)]
+        np.testing.assert_allclose(result, np.broadcast_to(a, result.shape), atol=1e-9)

@@ -61,12 +61,12 @@ def test_equals_least_squares_pixel_by_pixel():
     q[rng.random(q.shape) < 0.12] = 0.0  # and holes
     q[:2, :3] = 0.0
     # the oracle works on what the kernel is given
-    given = q.astype(np.float32)
-    seen = fit_surface(given, CAMERA, PARAMETERS)
+    values = q.astype(np.float32)
+    seen = fit_surface(values, CAMERA, PARAMETERS)
     expected = np.zeros(q.shape, bool)
     for v in range(q.shape[0]):
         for u in range(q.shape[1]):
-            fitted = naive(given.astype(float), v, u, PARAMETERS)
+            fitted = naive(values.astype(float), v, u, PARAMETERS)
             expected[v, u] = fitted is not None
             if fitted is not None and seen.valid[v, u]:
                 np.testing.assert_allclose(seen.points[v, u], fitted[0], rtol=1e-4, atol=1e-6)

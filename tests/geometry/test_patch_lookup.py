@@ -17,8 +17,8 @@ def test_it_is_the_nearest_that_fits():
     means, normals = rng.uniform(-1, 1, (n, 3)), unit(rng.normal(size=(n, 3)))
     patches = patches_of(means, normals, areas)
     at = np.hstack([rng.uniform(-1, 1, (m, 3)), unit(rng.normal(size=(m, 3)))]).astype(np.float32)
-    found = patches_at(at, patches)
-    for row, one in zip(at.astype(float), found.tolist(), strict=True):
+    result = patches_at(at, patches)
+    for row, one in zip(at.astype(float), result.tolist(), strict=True):
         best, index = np.inf, -1
         for j in range(n):
             apart = float(np.linalg.norm(row[:3] - means[j]))
@@ -26,7 +26,7 @@ def test_it_is_the_nearest_that_fits():
             if alike and apart < best and apart <= 4 * np.sqrt(areas[j] / np.pi):
                 best, index = apart, j
         assert one == index
-    assert 0 < (found < 0).sum() < m
+    assert 0 < (result < 0).sum() < m
 
 
 def test_no_patches_hold_no_points():

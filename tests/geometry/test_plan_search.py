@@ -72,9 +72,9 @@ def pose(x, y, z, yaw, pitch=0, roll=0):
     return T
 
 
-def nearest(found, true):
+def nearest(transforms, true):
     """Metres and degrees of the hypothesis that is nearest to a transform, and its rank."""
-    errors = [pose_difference(T, true) for T in found]
+    errors = [pose_difference(T, true) for T in transforms]
     best = min(range(len(errors)), key=lambda k: errors[k][0] + errors[k][1])
     return errors[best][0], math.degrees(errors[best][1]), best
 
@@ -105,13 +105,13 @@ def test_a_known_up_is_taken_as_it_is():
 def test_the_true_transform_is_proposed(yaw):
     source, target = pose(4, 5, 1.2, 12, 8, -5), pose(10, 3, 2.0, 12 + yaw, -4, 10)
     a, b = draw_plan(seen_from(source), P), draw_plan(seen_from(target), P)
-    found = plan_hypotheses([(a, b)], P)
-    metres, degrees, rank = nearest(found, inverse(target) @ source)
+    transforms = plan_hypotheses([(a, b)], P)
+    metres, degrees, rank = nearest(transforms, inverse(target) @ source)
     # half a cell, half a yaw (2.5 degrees, on a lever of some metres), half a step of height
     assert metres < 0.7
     assert degrees < 3.0
     assert rank < 4
-    assert len(found) == P.n_kept * P.n_heights
+    assert len(transforms) == P.n_kept * P.n_heights
 
 
 def test_slices_are_heights_above_the_lowest_point_of_the_neighbourhood():
@@ -127,13 +127,13 @@ def test_slices_are_heights_above_the_lowest_point_of_the_neighbourhood():
 def test_slices_propose_the_true_transform(yaw):
     source, target = pose(4, 5, 1.2, 12, 8, -5), pose(10, 3, 2.0, 12 + yaw, -4, 10)
     a, b = draw_plan(seen_from(source), P), draw_plan(seen_from(target), P)
-    found, values = slice_hypotheses(a, b, P)
-    metres, degrees, rank = nearest(found, inverse(target) @ source)
+    transforms, values = slice_hypotheses(a, b, P)
+    metres, degrees, rank = nearest(transforms, inverse(target) @ source)
     # half a cell of 1 m along both axes, half a yaw (2.5 degrees), half a step of height
     assert metres < 1.2
     assert degrees < 3.0
     assert rank < 4
-    assert len(found) == len(values) <= P.n_sliced * P.n_heights
+    assert len(transforms) == len(values) <= P.n_sliced * P.n_heights
     assert (np.diff(values) <= 0).all()
 
 

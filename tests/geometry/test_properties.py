@@ -86,8 +86,8 @@ def test_equals_the_letter_of_the_paper():
 def test_invariants_give_back_what_they_were_made_of():
     for given_ in ((0.7, 0.4, 2.9, -3.0), (2.0, 1.5, 0.1, 0.2), (1.0, 3.0, 1.6, 2.5)):
         patches = from_invariants(*given_)
-        found = invariants(patches, np.array([[0, 1]]))
-        np.testing.assert_allclose(found, [given_], rtol=0, atol=1e-12)
+        result = invariants(patches, np.array([[0, 1]]))
+        np.testing.assert_allclose(result, [given_], rtol=0, atol=1e-12)
 
 
 def test_right_angles_are_exact():

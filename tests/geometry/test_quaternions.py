@@ -12,12 +12,12 @@ AXES = [np.array(a, float) for a in itertools.product((-1, 0, 1), repeat=3) if a
 
 def rotations():
     """Random ones, and turns by and near 0, 90, 120 and 180 degrees about every simple axis."""
-    found = list(Rotation.random(300, random_state=1).as_matrix())
+    result = list(Rotation.random(300, random_state=1).as_matrix())
     for axis in AXES:
         for degrees in (0, 1e-9, 1e-6, 90, 120, 179.999, 180 - 1e-9, 180, 180 + 1e-9, 270):
             turn = np.radians(degrees) * axis / np.linalg.norm(axis)
-            found.append(Rotation.from_rotvec(turn).as_matrix())
-    return found
+            result.append(Rotation.from_rotvec(turn).as_matrix())
+    return result
 
 
 def test_both_ways_agree_with_scipy():

@@ -94,10 +94,10 @@ def test_a_fold_has_rays_only_before_it(k1):
     inner = r_seen < 0.98 * 2 / 3 * fold
     assert inner.sum() > 50
     # cosine of the true ray: root of k1 r^3 + r = r_seen below the fold
-    for rs, got in zip(r_seen[inner][::7], z[inner][::7], strict=True):
+    for rs, response in zip(r_seen[inner][::7], z[inner][::7], strict=True):
         roots = np.roots([k1, 0.0, 1.0, -rs])
         r = min(q.real for q in roots if abs(q.imag) < 1e-9 and q.real > -1e-9)
-        assert got == pytest.approx(1.0 / math.hypot(1.0, r), rel=1e-5)
+        assert response == pytest.approx(1.0 / math.hypot(1.0, r), rel=1e-5)
 
 
 def test_nothing_is_taken_behind_a_pole():

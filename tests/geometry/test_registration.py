@@ -33,12 +33,12 @@ def test_an_exact_corner_is_found_exactly():
     for _ in range(5):
         start = off(rng, 0.05, 3.0)
         before = start.copy()
-        found = refine(source, corner, start, replace(COARSE, iterations=20))
+        result = refine(source, corner, start, replace(COARSE, iterations=20))
         np.testing.assert_array_equal(start, before)  # the caller's is left alone
-        metres, radians = pose_difference(found.T, np.eye(4))
+        metres, radians = pose_difference(result.T, np.eye(4))
         assert metres < 1e-5
         assert radians < 1e-5
-        R = found.T[:3, :3]
+        R = result.T[:3, :3]
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 

@@ -44,9 +44,9 @@ def test_equals_the_oracle(n, metric):
 @pytest.mark.parametrize("number", [0, 1, 2, 5, 9, 33])
 def test_among_each_other(metric, number):
     signatures = random_bytes(number, number, 130)
-    found = pairwise_distances(signatures, metric)
-    assert found.tolist() == oracle(signatures, signatures, metric)
-    assert found.dtype == np.int64
+    actual = pairwise_distances(signatures, metric)
+    assert actual.tolist() == oracle(signatures, signatures, metric)
+    assert actual.dtype == np.int64
 
 
 @pytest.mark.parametrize("metric", METRICS)
@@ -67,9 +67,9 @@ def test_some_rows_are_compared_where_they_are(metric):
     whole = distances(query, database, metric)
     for rows in ([3, 4, 5, 6, 7, 8], [49, 0, 13, 13, 2], [49], []):
         wanted = np.array(rows, np.int64)
-        found = distances(query, database, metric, wanted)
-        assert found.tolist() == whole[wanted].tolist()
-        assert found.dtype == np.int64
+        actual = distances(query, database, metric, wanted)
+        assert actual.tolist() == whole[wanted].tolist()
+        assert actual.dtype == np.int64
     # of any layout and width of integer
     assert distances(query, database, metric, np.arange(50)[::7]).tolist() == whole[::7].tolist()
     short = np.arange(50, dtype=np.int16)
@@ -102,12 +102,12 @@ def full_sort(values, size):
 def test_ranking_equals_a_full_sort(values, size):
     """Few values, hence many ties, also at the cut."""
     given_ = np.array(values, np.int64)
-    found = rank(given_, size, 4.0)
-    assert found.indices.tolist() == full_sort(given_, size)
-    assert found.distances.tolist() == given_[found.indices].tolist()
-    assert found.similarities.tolist() == [max(1 - d / 4, 0.0) for d in found.distances.tolist()]
-    assert len(found) == min(size, len(values))
-    assert (found.indices.dtype, found.distances.dtype) == (np.intp, np.int64)
+    result = rank(given_, size, 4.0)
+    assert result.indices.tolist() == full_sort(given_, size)
+    assert result.distances.tolist() == given_[result.indices].tolist()
+    assert result.similarities.tolist() == [max(1 - d / 4, 0.0) for d in result.distances.tolist()]
+    assert len(result) == min(size, len(values))
+    assert (result.indices.dtype, result.distances.dtype) == (np.intp, np.int64)
 
 
 def test_size_of_a_ranking():

@@ -74,12 +74,12 @@ def test_nearest_rotation():
         R = Rotation.random(rng=rng).as_matrix()
         np.testing.assert_allclose(nearest_rotation(2.5 * R), R, atol=1e-12)
         M = rng.normal(size=(3, 3))  # half of them mirror
-        found = nearest_rotation(M)
-        assert_rotation(found)
-        gap = np.linalg.norm(found - M)
+        result = nearest_rotation(M)
+        assert_rotation(result)
+        gap = np.linalg.norm(result - M)
         others = Rotation.random(200, rng=rng).as_matrix()
         assert gap <= np.linalg.norm(others - M, axis=(1, 2)).min()
-        small = Rotation.from_rotvec(rng.normal(0, 1e-3, (50, 3))).as_matrix() @ found
+        small = Rotation.from_rotvec(rng.normal(0, 1e-3, (50, 3))).as_matrix() @ result
         assert gap <= np.linalg.norm(small - M, axis=(1, 2)).min() + 1e-12
 
 

@@ -56,14 +56,14 @@ BARE = {
 
 
 def leaves(record):
-    found = []
+    results = []
     for field in fields(record):
         value = getattr(record, field.name)
         if is_dataclass(value):
-            found += leaves(value)
+            results += leaves(value)
         elif isinstance(value, float):
-            found.append((type(record), field.name))
-    return found
+            results.append((type(record), field.name))
+    return results
 
 
 def test_every_number_is_a_length_or_bare():

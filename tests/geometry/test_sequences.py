@@ -46,16 +46,16 @@ def test_two_views_are_aligned_by_sequences():
     poses, (query, match) = zip(*furnished(model, 0, 36), strict=True)
     alignment = AlignmentParameters(sequence=replace(P, n_sources=40, n_coarse=40))
     p = ValidationParameters(alignment=alignment)
-    found = validate(query, match, 0, p, matching="sequence")
-    assert found.status == "accepted"
-    metres, radians = pose_difference(found.T_match_query, inverse(poses[1]) @ poses[0])
+    result = validate(query, match, 0, p, matching="sequence")
+    assert result.status == "accepted"
+    metres, radians = pose_difference(result.T_match_query, inverse(poses[1]) @ poses[0])
     assert metres < 0.05
     assert radians < 0.03
     # not by the histograms behind one's back
     blank = replace(query, descriptors=np.zeros_like(query.descriptors))
     again = validate(blank, match, 0, p, matching="sequence")
     assert again.T_match_query is not None
-    np.testing.assert_array_equal(again.T_match_query, found.T_match_query)
+    np.testing.assert_array_equal(again.T_match_query, result.T_match_query)
     unknown = "letters"
     with pytest.raises(ValueError, match="does not exist"):
         validate(query, match, matching=unknown)

@@ -41,12 +41,12 @@ def view(*, box):
 
 def poses(count):
     """Sensors a centimetre apart, half a million metres from where the parent frame begins."""
-    found = []
+    results = []
     for i in range(count):
         T = np.eye(4)
         T[:3, 3] = (500_000.0 + 0.01 * i, -4_000_000.0, 30.0)
-        found.append(T)
-    return found
+        results.append(T)
+    return results
 
 
 def cells_of(surface, sensors):
@@ -103,5 +103,5 @@ def test_cells_lie_at_the_mean_of_what_frames_saw_in_them():
     points = np.array([[0.01, 0.0, 0.0], [0.03, 0.04, 0.0], [-0.01, 0.0, 0.2]])
     cells = merge_views({}, [view_cells(points, CELL_M, ViewStamp(0, None, NO_SESSION))])
     assert count_cells(cells) == 2
-    found = cell_positions(cells, CELL_M)
-    np.testing.assert_allclose(found, [[-0.01, 0.0, 0.2], [0.02, 0.02, 0.0]], atol=CELL_M / 256)
+    result = cell_positions(cells, CELL_M)
+    np.testing.assert_allclose(result, [[-0.01, 0.0, 0.2], [0.02, 0.02, 0.0]], atol=CELL_M / 256)

@@ -86,12 +86,12 @@ def test_refinement_works_on_the_points(lidar):
     T = np.eye(4)
     T[:3, 3] = np.array(places[0]) - np.array(places[1])
     fine = lidar.parameters.validation.alignment.fine
-    found = refine_transform(a, b, T, fine)
-    assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 0.02
+    result = refine_transform(a, b, T, fine)
+    assert np.linalg.norm(result[:3, 3] - T[:3, 3]) < 0.02
     plain = [replace(one, surface=replace(one.surface, spread=None)) for one in (a, b)]
     coarse = refine_transform(plain[0], plain[1], T, fine)
     off = math.inf if coarse is None else float(np.linalg.norm(coarse[:3, 3] - T[:3, 3]))
-    assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < off
+    assert np.linalg.norm(result[:3, 3] - T[:3, 3]) < off
 
 
 @pytest.mark.parametrize("at", [0.0, 3e5])

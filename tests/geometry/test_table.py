@@ -83,15 +83,15 @@ def test_centres_by_hand():
 def test_a_pair_weighs_the_product_of_its_patches():
     patches = scenes.random_patches(np.random.default_rng(4), 12)
     weights = np.random.default_rng(5).uniform(0.1, 3, 12)
-    found = count_pairs(patches.means, patches.normals, weights, SMALL, P)
+    result = count_pairs(patches.means, patches.normals, weights, SMALL, P)
     expected = np.zeros(SMALL.n_bins)
     pairs = neighbour_pairs(patches, P)
     indices = np.ravel_multi_index(bins_of(invariants(patches, pairs), SMALL), shape(SMALL))
     for index, (mu, alpha) in zip(indices, pairs, strict=True):
         expected[index] += weights[mu] * weights[alpha]
-    np.testing.assert_allclose(found.weights, expected, rtol=1e-5, atol=1e-6)
-    assert found.total == pytest.approx(expected.sum(), rel=1e-6)
-    assert found.n_pairs == len(pairs)
+    np.testing.assert_allclose(result.weights, expected, rtol=1e-5, atol=1e-6)
+    assert result.total == pytest.approx(expected.sum(), rel=1e-6)
+    assert result.n_pairs == len(pairs)
 
 
 def model(rng, g):

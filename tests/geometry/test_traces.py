@@ -84,13 +84,13 @@ def test_patches_coincide_with_each_others_nearest():
         (5.1, 0, 2), (4.2, 0, 2), (3, 0, 2, 1.0, 0.0, 0.0), (2.04, 0, 2), (1.03, 0.04, 2)
     )
     surface = wall(2.0)
-    found = trace(framed(surface, query), framed(surface, match), T, P)
+    result = trace(framed(surface, query), framed(surface, match), T, P)
     # (1.05: at 2.05, nearer than 1's 2.0) (2: its normal differs) (3: 0.2 m off)
     # (4: at 5.0 with cos 0.8)
-    assert found.pairs.tolist() == [[2, 3], [0, 4]]
-    assert found.distances == pytest.approx([0.01, 0.05])
-    assert (found.of_query == point_verdicts(found.query, surface, T, P)).all()
-    assert (found.of_match == point_verdicts(found.match, surface, inverse(T), P)).all()
+    assert result.pairs.tolist() == [[2, 3], [0, 4]]
+    assert result.distances == pytest.approx([0.01, 0.05])
+    assert (result.of_query == point_verdicts(result.query, surface, T, P)).all()
+    assert (result.of_match == point_verdicts(result.match, surface, inverse(T), P)).all()
     nothing = trace(framed(surface, patches((0, 0, 9))), framed(surface, match), T, P)
     assert (nothing.pairs.shape, nothing.distances.shape) == ((0, 2), (0,))
 

@@ -56,29 +56,29 @@ def turned(points, R):
     return (points.astype(np.float64) @ R.T).astype(np.float32)
 
 
-def angle(found, truth):
-    return math.degrees(math.acos(min(1.0, max(-1.0, float(found.up @ truth)))))
+def angle(result, truth):
+    return math.degrees(math.acos(min(1.0, max(-1.0, float(result.up @ truth)))))
 
 
 @pytest.mark.parametrize(("index", "axis"), [(0, "-x"), (4, "-z"), (6, "-y")])
 def test_up_of_a_mesh_of_a_furnished_room(index, axis):
     vertices, faces = room(index)
-    found = estimate_up(turned(vertices, TURNS[axis]), faces, Z)
-    np.testing.assert_array_equal(found.up, TURNS[axis] @ Z)  # an axis is taken exactly
-    assert found.is_clear
+    estimate = estimate_up(turned(vertices, TURNS[axis]), faces, Z)
+    np.testing.assert_array_equal(estimate.up, TURNS[axis] @ Z)  # an axis is taken exactly
+    assert estimate.is_clear
 
 
 @pytest.mark.parametrize(("index", "axis"), [(4, "-y")])
 def test_up_of_a_cloud_of_a_furnished_room(index, axis):
-    found = estimate_up(turned(samples(index), TURNS[axis]), None, Z)
-    np.testing.assert_array_equal(found.up, TURNS[axis] @ Z)
-    assert found.is_clear
+    estimate = estimate_up(turned(samples(index), TURNS[axis]), None, Z)
+    np.testing.assert_array_equal(estimate.up, TURNS[axis] @ Z)
+    assert estimate.is_clear
 
 
 @pytest.mark.parametrize(("index", "axis"), [(1, "y"), (3, "-z")])
 def test_up_of_scans(index, axis):
-    found = estimate_up(turned(survey(index), TURNS[axis]), None, Z)
-    assert angle(found, TURNS[axis] @ Z) < 2.0
+    estimate = estimate_up(turned(survey(index), TURNS[axis]), None, Z)
+    assert angle(estimate, TURNS[axis] @ Z) < 2.0
 
 
 def test_a_tilted_room_is_upright_along_its_walls():
@@ -87,8 +87,8 @@ def test_a_tilted_room_is_upright_along_its_walls():
         [[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]
     )
     for turn in (TURNS["z"], TURNS["-y"]):
-        found = estimate_up(turned(samples(4), turn @ R), None, Z)
-        assert angle(found, turn @ R @ Z) < 1.0
+        estimate = estimate_up(turned(samples(4), turn @ R), None, Z)
+        assert angle(estimate, turn @ R @ Z) < 1.0
 
 
 def test_ground_that_slopes_leaves_the_usual_axis():
@@ -96,8 +96,8 @@ def test_ground_that_slopes_leaves_the_usual_axis():
     R = np.array(
         [[math.cos(slope), 0, math.sin(slope)], [0, 1, 0], [-math.sin(slope), 0, math.cos(slope)]]
     )
-    found = estimate_up(turned(survey(3), R), None, Z)
-    np.testing.assert_array_equal(found.up, Z)
+    estimate = estimate_up(turned(survey(3), R), None, Z)
+    np.testing.assert_array_equal(estimate.up, Z)
 
 
 def test_an_empty_cube_is_as_usual_and_not_clear():
@@ -107,18 +107,18 @@ def test_an_empty_cube_is_as_usual_and_not_clear():
          (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)], np.int32
     )  # fmt: skip
     for usual in (*np.eye(3), *-np.eye(3)):
-        found = estimate_up(corners, faces, usual)
-        np.testing.assert_array_equal(found.up, usual)
-        assert not found.is_clear
+        estimate = estimate_up(corners, faces, usual)
+        np.testing.assert_array_equal(estimate.up, usual)
+        assert not estimate.is_clear
 
 
 @pytest.mark.parametrize("n", [1, 2, 11, 500])
 def test_surfaces_that_show_nothing_are_as_usual(n):
     spread = np.random.default_rng(0).normal(size=(n, 3)).astype(np.float32)
     for points in (spread, np.zeros((n, 3), np.float32), spread * np.array([1, 0, 0], np.float32)):
-        found = estimate_up(points, None, Z)
-        assert math.isclose(float(np.linalg.norm(found.up)), 1.0)
-        assert not (found.is_clear and n < 12)
+        estimate = estimate_up(points, None, Z)
+        assert math.isclose(float(np.linalg.norm(estimate.up)), 1.0)
+        assert not (estimate.is_clear and n < 12)
 
 
 @pytest.mark.parametrize(

@@ -238,34 +238,34 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms):
         a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
         there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
         back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
-        found = answer(query, match)
+        result = answer(query, match)
         poses = np.stack([there.T, inverse(back.T)])
-        assert found.T_match_query is not None
-        if found.residual_m < 0.08 and found.residual_rad < math.radians(5):
+        assert result.T_match_query is not None
+        if result.residual_m < 0.08 and result.residual_rad < math.radians(5):
             met += 1
-            np.testing.assert_array_equal(middle(*poses), found.T_match_query)
-            assert found.directions == ("query_to_match", "match_to_query")
-            assert found.T_other is None
+            np.testing.assert_array_equal(middle(*poses), result.T_match_query)
+            assert result.directions == ("query_to_match", "match_to_query")
+            assert result.T_other is None
             continue
         apart += 1
         seen = plane_agreement(a.planes, b.planes, poses, p.agreement)
         best = int(np.argmax(seen.share - seen.violations))
-        np.testing.assert_array_equal(found.T_match_query, poses[best])
+        np.testing.assert_array_equal(result.T_match_query, poses[best])
         # the other one is not lost
-        np.testing.assert_array_equal(found.T_other, poses[1 - best])
-        assert found.directions == (("query_to_match", "match_to_query")[best],)
-        assert found.plane_overlap == seen.share[best]
-        assert found.plane_violations == seen.violations[best]
-        assert found.status == "rejected"
+        np.testing.assert_array_equal(result.T_other, poses[1 - best])
+        assert result.directions == (("query_to_match", "match_to_query")[best],)
+        assert result.plane_overlap == seen.share[best]
+        assert result.plane_violations == seen.violations[best]
+        assert result.status == "rejected"
     assert apart >= 1
     assert met >= 1
 
 
-def elsewhere(found):
+def elsewhere(result):
     """The same search, had it found a place a metre off and half a turn round."""
     T = np.diag([-1.0, 1.0, -1.0, 1.0])
     T[0, 3] = 1.0
-    return replace(found, T=T @ found.T, others=found.others[:0])
+    return replace(result, T=T @ result.T, others=result.others[:0])
 
 
 def test_what_one_search_alone_finds_is_judged_by_the_evidence(pairs):
@@ -276,26 +276,26 @@ def test_what_one_search_alone_finds_is_judged_by_the_evidence(pairs):
         back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
         assert there is not None
         assert back is not None
-        for one, other, who in (
+        for one, other, robot in (
             (there, elsewhere(back), "query_to_match"),
             (elsewhere(there), back, "match_to_query"),
         ):
-            found = sane(_decide(a, b, one, other, 0, p, "full"))
+            result = sane(_decide(a, b, one, other, 0, p, "full"))
             # the residual alone cannot tell the two apart
             assert _decide(a, b, one, other, 0, p, "paper").status == "rejected"
-            assert found.directions == (who,)
-            assert found.T_other is not None
-            if found.status != "accepted":
-                assert "the two directions disagree" in found.reason
+            assert result.directions == (robot,)
+            assert result.T_other is not None
+            if result.status != "accepted":
+                assert "the two directions disagree" in result.reason
                 continue
             accepted += 1
-            metres, degrees = off(found, T)
+            metres, degrees = off(result, T)
             assert metres < 0.05
             assert degrees < 5.0
-            assert found.strength == "weak"
-            assert found.residual_m <= p.acceptance.residual_m
-            assert found.covariance is not None
-            assert found.reason.endswith("planes, but only one direction found it")
+            assert result.strength == "weak"
+            assert result.residual_m <= p.acceptance.residual_m
+            assert result.covariance is not None
+            assert result.reason.endswith("planes, but only one direction found it")
     assert accepted >= 3
 
 
@@ -318,9 +318,9 @@ def test_sides_of_a_cube_are_not_told_apart(model):
     assert there is not None
     assert back is not None
     apart = replace(there, T=v.T_match_query), replace(back, T=inverse(v.T_rival))
-    found = sane(_decide(a, b, *apart, 0, p, "full"))
-    assert found.status == "rejected"
-    assert "the two directions disagree" in found.reason
+    result = sane(_decide(a, b, *apart, 0, p, "full"))
+    assert result.status == "rejected"
+    assert "the two directions disagree" in result.reason
     free = replace(p.acceptance, ambiguous=9.0, ambiguous_share=9.0)
     assert _decide(a, b, *apart, 0, replace(p, acceptance=free), "full").status == "accepted"
 
@@ -345,8 +345,8 @@ def test_wrong_calls(pairs):
 
 def test_refined_at_the_truth_stays_there(pairs):
     for query, match, T in pairs:
-        found = refine_transform(query, match, T)
-        metres, radians = pose_difference(found, T)
+        result = refine_transform(query, match, T)
+        metres, radians = pose_difference(result, T)
         assert metres < 0.03
         assert math.degrees(radians) < 1.0
     far = np.eye(4)

@@ -76,7 +76,7 @@ def scanned(room, T, rng):
 @pytest.fixture(scope="module")
 def rooms(frame_of):
     """Two furnished rooms, scanned twice each, half a metre and 100 degrees apart."""
-    found = []
+    results = []
     for number in (2, 5):
         room, rng = room_and_rng(11, number)
         middle = room.outline.mean(axis=0)
@@ -84,8 +84,8 @@ def rooms(frame_of):
         for T in (pose(*middle, 20.0), pose(middle[0] + 0.4, middle[1] - 0.3, 120.0)):
             points = scanned(room, T, rng)
             views.append(View(T, points, frame_of(Cloud(points))))
-        found.append((room, views))
-    return found
+        results.append((room, views))
+    return results
 
 
 @pytest.fixture(scope="module")

@@ -32,5 +32,5 @@ def test_coherence_is_the_length_of_the_mean_normal():
         areas=np.array([[1, 1, 3, 1]], np.float32),
         camera=Intrinsics(4, 1, 1.0, 1.0, 0.0, 0.0),
     )
-    found = extract_patches(surface, np.array([[0, 0, 1, 1]], np.int32))
-    np.testing.assert_allclose(found.coherences, [1.0, np.hypot(3, 1) / 4], rtol=1e-6)
+    result = extract_patches(surface, np.array([[0, 0, 1, 1]], np.int32))
+    np.testing.assert_allclose(result.coherences, [1.0, np.hypot(3, 1) / 4], rtol=1e-6)

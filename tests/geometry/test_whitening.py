@@ -41,9 +41,9 @@ def projected(psi, fit):
 def test_products_are_exact_at_the_ends_of_their_range():
     basis = np.array([[127] * 25_000, [-127] * 25_000], np.int8)
     psi = np.full(25_000, round(UNITS / np.sqrt(25_000)), np.int16)  # of length 1
-    found = np.empty(2, np.int32)
-    _products(basis, psi, found)
-    assert found.tolist() == (basis.astype(np.int64) @ psi.astype(np.int64)).tolist()
+    result = np.empty(2, np.int32)
+    _products(basis, psi, result)
+    assert result.tolist() == (basis.astype(np.int64) @ psi.astype(np.int64)).tolist()
 
 
 def test_the_same_as_numpy(psi, fit):

@@ -81,8 +81,8 @@ def quarter(axis, shift=(0.0, 0.0, 0.0)):
 
 def check_projecting(module):
     def seen(camera, at):
-        found = module.project(camera_of(camera, 0.1), *map(float, at))
-        return tuple(round(value, 9) for value in found)
+        result = module.project(camera_of(camera, 0.1), *map(float, at))
+        return tuple(round(value, 9) for value in result)
 
     assert seen(CAMERA, (0, 0, 2)) == (20.5, 15.5, 2.0)
     assert seen(CAMERA, (0.2, 0.1, 2)) == (26.2, 18.35, 2.0)
@@ -97,10 +97,10 @@ def check_projecting(module):
             (179.5, 0, 35.95, 8.5), (-180, 0, 0.0, 8.5), (90, 80, 27.0, 0.5), (7, 89, 18.7, -0.4),
         ):  # fmt: skip
             for r in (0.2, 3.0):
-                found = seen(camera, ray(azimuth, elevation, pole) * r)
-                np.testing.assert_allclose(found[1:], (line, r), atol=1e-6)
-                around = (found[0] - column) % 36
-                assert min(around, 36 - around) < 1e-6, (azimuth, found)
+                result = seen(camera, ray(azimuth, elevation, pole) * r)
+                np.testing.assert_allclose(result[1:], (line, r), atol=1e-6)
+                around = (result[0] - column) % 36
+                assert min(around, 36 - around) < 1e-6, (azimuth, result)
         assert seen(camera, ray(20, 0, pole) * 0.09)[:2] == (-1.0, -1.0)
         assert seen(camera, (0, 0, 0)) == (-1.0, -1.0, 0.0)
     # of an image that is no full turn the far side is beyond the last column
@@ -139,27 +139,27 @@ def check_targets(module):
     np.testing.assert_array_equal(t.normals[0], whole.normals[0, first])
     none = 0
     for at in np.concatenate([rng.uniform(-1.3, 1.3, (60, 3)), [[0.39, 0.0, 9.0]]]):
-        found = module.nearest_alike(
+        result = module.nearest_alike(
             t.points, t.normals, t.camera, t.heads, t.chain, at, np.array([0, 0.0, 1]), 0.7
         )
         away = np.linalg.norm(t.points[0] - at, axis=1)
         away[t.normals[0, :, 2] <= 0.7] = np.inf
         best = int(away.argmin())
         if away[best] < 0.4:
-            assert found[0] == best
-            np.testing.assert_allclose(found[1], away[best] ** 2, rtol=1e-5)
+            assert result[0] == best
+            np.testing.assert_allclose(result[1], away[best] ** 2, rtol=1e-5)
         else:
-            assert found[0] == -1
+            assert result[0] == -1
             none += 1
     assert 5 < none < 50
     # of two as far off the first, whichever is walked to first
     for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
         pair = np.array([[0.25, 0, 0], [-0.25, 0, 0], [0, 0.25, 0]])[order]
         t = module.lookup_target(in_no_order(pair, np.tile([0, 0, 1.0], (3, 1))), 0.1, 0.4)
-        found = module.nearest_alike(
+        result = module.nearest_alike(
             t.points, t.normals, t.camera, t.heads, t.chain, np.zeros(3), np.array([0, 0, 1.0]), 0.7
         )
-        assert found == (0, 0.0625)
+        assert result == (0, 0.0625)
     # a pinhole's and a sphere's maps are looked up as they are
     for seen in (wall(2.0), ball(2.0)):
         t = module.lookup_target(seen, 0.1, 0.4)
@@ -189,7 +189,7 @@ def check_agreement_of_clouds(module):
         reference_depth=2.0, nearest=0.3, edge_px=1,
     )  # fmt: skip
 
-    def found(source, target, T=None):
+    def agreement_of(source, target, T=None):
         result = module.overlap_counts(source, target, np.eye(4) if T is None else T, p)
         return result.inliers, result.violations
 
@@ -202,35 +202,35 @@ def check_agreement_of_clouds(module):
             (0.31, through), (0.29, nothing), (2.05, on), (2.10, nothing), (9.0, nothing),
         ):  # fmt: skip
             at = round((azimuth + 175) / 10) * 10 - 175, round(elevation / 10) * 10
-            assert found(faced(*at, r), whole) == expected, (at, r)
+            assert agreement_of(faced(*at, r), whole) == expected, (at, r)
     # at four metres everything is four times as wide, and twice where lengths grow linearly
     p = replace(p, point_tolerance=0.5)
     for r, square, linear in ((4.19, on, nothing), (4.09, on, on), (4.21, nothing, through)):
         p = replace(p, growth=2)
-        assert found(faced(5, 0, 4.0), ball(r)) == square
+        assert agreement_of(faced(5, 0, 4.0), ball(r)) == square
         p = replace(p, growth=1)
-        assert found(faced(5, 0, 4.0), ball(r)) == linear
+        assert agreement_of(faced(5, 0, 4.0), ball(r)) == linear
     p = replace(p, growth=2, point_tolerance=0.15)
     # 10 cm before the far side, which lies beyond a surface just across the seam
     r = np.full((17, 36), 2.0)
     r[:, 35] = 1.0
     for azimuth, expected in ((-175, nothing), (-165, through), (175, on)):
-        assert found(faced(azimuth, 0, 1.0), ball(r)) == expected
+        assert agreement_of(faced(azimuth, 0, 1.0), ball(r)) == expected
     r = np.full((17, 36), 2.0)
     r[:, 0] = 1.0
-    assert found(faced(175, 0, 1.0), ball(r)) == nothing
+    assert agreement_of(faced(175, 0, 1.0), ball(r)) == nothing
     # in an image that is no full turn nothing is across it
     some = replace(BALL, width=18)
-    assert found(faced(-175, 0, 1.0), ball(2.0, some)) == through
-    assert found(faced(175, 0, 1.0), ball(2.0, some)) == nothing
+    assert agreement_of(faced(-175, 0, 1.0), ball(2.0, some)) == through
+    assert agreement_of(faced(175, 0, 1.0), ball(2.0, some)) == nothing
     r = np.full((17, 18), 2.0)
     r[:, 17] = 1.0
-    assert found(faced(-175, 0, 1.0), ball(r, some)) == through
+    assert agreement_of(faced(-175, 0, 1.0), ball(r, some)) == through
     # transforms act on points and normals
     T = quarter(0, (0.0, 1.0, 0.0))
     there = faced(-175, 10, 2.0)
     before = np.concatenate([(there[0, :3] - T[:3, 3]) @ T[:3, :3], there[0, 3:] @ T[:3, :3]])
-    assert found(before[None].astype(np.float32), whole, T) == on
+    assert agreement_of(before[None].astype(np.float32), whole, T) == on
     # points in no order: a floor of points 2 cm apart; nothing is known of free space
     xy = np.array(list(product(np.arange(-10, 11) * 0.02, repeat=2))) + np.array([0.1, 0.0])
     floor = in_no_order(np.c_[xy, np.zeros(len(xy))], np.broadcast_to([0.0, 0, 1], (len(xy), 3)))
@@ -242,11 +242,11 @@ def check_agreement_of_clouds(module):
         ((0.0, 0.0, -0.06), up, 0),
     ):  # fmt: skip
         source = np.array([[*at, *facing]], np.float32)
-        assert found(source, floor) == (inliers, None), at
+        assert agreement_of(source, floor) == (inliers, None), at
         # and carried elsewhere and back
         T = quarter(1, (3.0, -2.0, 7.0))
         away = in_no_order(floor.points[0] @ T[:3, :3].T + T[:3, 3], floor.normals[0] @ T[:3, :3].T)
-        assert found(source, away, T) == (inliers, None), at
+        assert agreement_of(source, away, T) == (inliers, None), at
     both = np.array([[0, 0, 0, *up], [0.1, 0, 0, *up], [0, 0, 1, *up]], np.float32)
     weights = np.array([0.5, 0.25, 4.0], np.float32)
     assert module.agreements(both, floor, np.eye(4)[None], p, weights).tolist() == [[0.75, 0.0]]
@@ -377,23 +377,23 @@ def check_registration(module):
     at = (CAMERA.cx + 0.1 * 57, CAMERA.cy + 0.05 * 57)
     point = seen_at(at, 2.0)
     np.testing.assert_allclose(point[0, :3], [0.2, 0.1, 2.0], atol=1e-6)
-    found = once(point, wall(1.97))
+    result = once(point, wall(1.97))
     # Tukey's weight (1 - .3^2)^2; both depths are 2: over .25 + (16 + 16) / 8
     row = np.array([-0.1, 0.2, 0.0, 0.0, 0.0, -1.0])
     weight = (1 - 0.3**2) ** 2 / 4.25
-    np.testing.assert_allclose(found.information, weight * np.outer(row, row), atol=1e-6)
-    assert found.points == 1
+    np.testing.assert_allclose(result.information, weight * np.outer(row, row), atol=1e-6)
+    assert result.points == 1
     # the shortest step that brings it onto the wall: residual -3 cm, |row|^2 = 1.05
     step = 0.03 / 1.05 * row
-    np.testing.assert_allclose(found.T[:3, 3], step[3:], atol=1e-5)
+    np.testing.assert_allclose(result.T[:3, 3], step[3:], atol=1e-5)
     np.testing.assert_allclose(
-        [found.T[2, 1], found.T[0, 2], found.T[1, 0]], [step[0], step[1], 0.0], atol=1e-5
+        [result.T[2, 1], result.T[0, 2], result.T[1, 0]], [step[0], step[1], 0.0], atol=1e-5
     )
     # a point counts by its depth in both frames: 1 m before the source, 2 m before the target
     forward = np.eye(4)
     forward[2, 3] = 1.0
-    found = once(seen_at(CENTRE, 1.0), wall(2.0), T=forward)
-    np.testing.assert_allclose(found.information[5, 5], 1 / (0.25 + 17 / 8), rtol=1e-6)
+    result = once(seen_at(CENTRE, 1.0), wall(2.0), T=forward)
+    np.testing.assert_allclose(result.information[5, 5], 1 / (0.25 + 17 / 8), rtol=1e-6)
     # beyond the gate, which grows with z^2, a point is forgotten
     for z, gap, takes_part in (
         (2.0, 0.09, True), (2.0, 0.11, False), (2.0, -0.11, False), (4.0, 0.39, True),
@@ -439,16 +439,16 @@ def check_registration(module):
         p = module.RefinementParameters(
             1, iterations, 0.1, 0.02, reference_depth=2.0, minimum_points=least
         )
-        found = module.refine(some, wall(2.0), np.eye(4), p)
-        assert (found and found.points) == points
-        assert found is None or np.abs(found.T - np.eye(4)).max() < 2e-3
+        result = module.refine(some, wall(2.0), np.eye(4), p)
+        assert (result and result.points) == points
+        assert result is None or np.abs(result.T - np.eye(4)).max() < 2e-3
     # at first only every second point takes part, at last all do
     for iterations, last, points in ((1, 0, 3), (1, 1, 6), (3, 1, 6), (3, 0, 3)):
         p = module.RefinementParameters(
             1, iterations, 0.1, 0.1, minimum_points=5, thinning=2, last_iterations=last
         )
-        found = module.refine(some[:6], wall(2.0), np.eye(4), p)
-        assert found.points == points
+        result = module.refine(some[:6], wall(2.0), np.eye(4), p)
+        assert result.points == points
     # of points 1 and 3, which alone are off by 6 cm, the first steps know nothing
     uneven = np.concatenate(
         [seen_at(pixel, 1.94 if i % 2 else 2.0) for i, pixel in enumerate(ring)]
@@ -457,8 +457,8 @@ def check_registration(module):
         p = module.RefinementParameters(
             1, 3, 0.1, 0.1, minimum_points=1, thinning=thinning, last_iterations=0
         )
-        found = module.refine(uneven, wall(2.0), np.eye(4), p)
-        assert (abs(found.T[2, 3]) + np.abs(found.T[:3, :3] - np.eye(3)).max() > 1e-3) == moved
+        result = module.refine(uneven, wall(2.0), np.eye(4), p)
+        assert (abs(result.T[2, 3]) + np.abs(result.T[:3, :3] - np.eye(3)).max() > 1e-3) == moved
 
 
 def check_registration_of_clouds(module):
@@ -471,17 +471,17 @@ def check_registration_of_clouds(module):
 
     # one point, 3 cm before a sphere of 2 m: it faces the viewpoint, so no turn moves it
     u = ray(-125, 40)
-    found = once(faced(-125, 40, 1.97), ball(2.0), 1)
+    result = once(faced(-125, 40, 1.97), ball(2.0), 1)
     row = np.concatenate([np.zeros(3), u])
     for kind, near in ((1, 1.97), (2, 0.0), (0, 1.97 * u[2])):
         weight = (1 - 0.3**2) ** 2 / (0.25 + (near**4 + 1.97**4) / 8)
-        found = once(faced(-125, 40, 1.97), ball(2.0), kind)
-        np.testing.assert_allclose(found.information, weight * np.outer(row, row), atol=1e-6)
-        np.testing.assert_allclose(found.T[:3, 3], 0.03 * u, atol=1e-5)
+        result = once(faced(-125, 40, 1.97), ball(2.0), kind)
+        np.testing.assert_allclose(result.information, weight * np.outer(row, row), atol=1e-6)
+        np.testing.assert_allclose(result.T[:3, 3], 0.03 * u, atol=1e-5)
     # twice as far before weights fall: as if at half the depth
-    found = once(faced(-125, 40, 1.97), ball(2.0), 1, replace(p, weight_depth=2.0))
+    result = once(faced(-125, 40, 1.97), ball(2.0), 1, replace(p, weight_depth=2.0))
     weight = (1 - 0.3**2) ** 2 / (0.25 + (1.97 / 2) ** 4 / 4)
-    np.testing.assert_allclose(found.information, weight * np.outer(row, row), atol=1e-6)
+    np.testing.assert_allclose(result.information, weight * np.outer(row, row), atol=1e-6)
     # gates grow with range
     for r, growth, takes_part in ((4.39, 2, True), (4.21, 1, False), (4.19, 1, True), (4.09, 0, 1)):
         q = replace(p, growth=growth)
@@ -491,8 +491,8 @@ def check_registration_of_clouds(module):
         r = np.zeros((17, 36))
         r[:, column] = 2.0
         near = faced(azimuth + (4.9 if azimuth > 0 else -4.9), 0, 2.0)
-        found = once(near, ball(r), 1, replace(p, first_gate=0.2, last_gate=0.2))
-        assert (found is not None) == (column in (0, 35)), column
+        result = once(near, ball(r), 1, replace(p, first_gate=0.2, last_gate=0.2))
+        assert (result is not None) == (column in (0, 35)), column
     # an image that is no full turn has an edge
     some = replace(BALL, width=18)
     for azimuth, takes_part in ((-175, False), (-165, True), (-15, True), (-5, False)):
@@ -506,11 +506,11 @@ def check_registration_of_clouds(module):
     source = np.array([[0.2, 0.1, 1.97, 0.0, 0.0, -1.0]], np.float32)
     row = np.array([-0.1, 0.2, 0.0, 0.0, 0.0, -1.0])
     for kind, near in ((0, 1.97), (1, math.sqrt(0.05 + 1.97**2)), (2, 0.0)):
-        found = once(source, target, kind)
+        result = once(source, target, kind)
         weight = (1 - 0.3**2) ** 2 / (0.25 + near**4 / 4)
-        np.testing.assert_allclose(found.information, weight * np.outer(row, row), atol=1e-6)
-        assert found.points == 1
-        np.testing.assert_allclose(found.T[:3, 3], -0.03 / 1.05 * row[3:], atol=1e-5)
+        np.testing.assert_allclose(result.information, weight * np.outer(row, row), atol=1e-6)
+        assert result.points == 1
+        np.testing.assert_allclose(result.T[:3, 3], -0.03 / 1.05 * row[3:], atol=1e-5)
     for z, takes_part in ((1.91, True), (1.89, False), (2.09, True), (2.11, False)):
         source[0, 2] = z
         assert (once(source, target, 0) is not None) == takes_part

@@ -54,8 +54,8 @@ def _mend_settings(module):
     settings = module.Settings
     init, copy = settings.__init__, settings.model_copy
 
-    def begin(self, *args, **given):
-        init(self, *args, **given)
+    def begin(self, *args, **fields):
+        init(self, *args, **fields)
         if self.database_url is None:
             self.__dict__["database_url"] = SecretStr(url_of(self.data_dir))
 
@@ -77,11 +77,11 @@ def _mend_psycopg(module):
         with connect(module.Connection, server, autocommit=True) as connection:
             connection.execute(statement)
 
-    def resolved(cls, conninfo="", **given):
-        name = given.get("dbname") or parsed(conninfo).get("dbname") or ""
+    def resolved(cls, conninfo="", **fields):
+        name = fields.get("dbname") or parsed(conninfo).get("dbname") or ""
         if name.startswith(PREFIX):
-            given["dbname"] = database_of(Path(name.removeprefix(PREFIX)), execute)
-        return connect(cls, conninfo, **given)
+            fields["dbname"] = database_of(Path(name.removeprefix(PREFIX)), execute)
+        return connect(cls, conninfo, **fields)
 
     module.Connection.connect = classmethod(resolved)
     module.connect = module.Connection.connect

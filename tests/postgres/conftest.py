@@ -23,11 +23,11 @@ class Small(NamedTuple):
 @pytest.fixture(scope="session")
 def small(room_frames, small_image):
     """Frames with different content, from different offsets."""
-    found = []
+    results = []
     for number in range(12):
         data, lens = small_image(room_frames[number % 6], *divmod(number, 4))
-        found.append(Small(data, FrameMeta(intrinsics=lens)))
-    return found
+        results.append(Small(data, FrameMeta(intrinsics=lens)))
+    return results
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ def index(engine, frame):
     return added.frame_id
 
 
-def found(engine, frame):
+def matches_of(engine, frame):
     answer = engine.queries.upload(["hall"], *frame, ASKED)
     return sorted(match.frame_id for match in answer.matches)
 
@@ -38,20 +38,20 @@ def found(engine, frame):
 @pytest.fixture
 def events(engine):
     """What a stream of events tells, from the first on."""
-    found = []
+    results = []
     ended = threading.Event()
-    thread = threading.Thread(target=_follow, args=(engine.store.database, found, ended))
+    thread = threading.Thread(target=_follow, args=(engine.store.database, results, ended))
     thread.start()
-    yield found
+    yield results
     ended.set()
     thread.join()
 
 
-def _follow(database, found, ended):
+def _follow(database, seen_events, ended):
     async def follow():
         feed = Feed(database, most=1, retained=1000)
         feed.join()
-        reading = asyncio.ensure_future(_gather(feed, found))
+        reading = asyncio.ensure_future(_gather(feed, seen_events))
         while not ended.is_set():
             await asyncio.sleep(0.02)
         feed.close()
@@ -61,9 +61,9 @@ def _follow(database, found, ended):
     asyncio.run(follow())
 
 
-async def _gather(feed, found):
+async def _gather(feed, seen_events):
     async for events, _ in feed.batches(EventFilter(), 0, lambda: True):
-        found += events
+        seen_events += events
 
 
 def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
@@ -71,7 +71,7 @@ def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
 ):
     primary, standby = pair
     engine.create_map(NewMap(name="hall", model="depth"))
-    kept = [index(engine, frame) for frame in small[:2]]
+    ids = [index(engine, frame) for frame in small[:2]]
     written = "SELECT pg_current_wal_lsn()::text"
     (at,) = primary.execute(written)[0]
     until(lambda: standby.execute(f"SELECT pg_last_wal_replay_lsn() >= '{at}'")[0][0])
@@ -80,7 +80,7 @@ def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
     until(lambda: primary.execute("SELECT count(*) FROM pg_stat_replication")[0] == (0,))
     before = engine.store.database.history
     lost = index(engine, small[2])
-    assert found(engine, small[2]) == sorted([*kept, lost])  # held in memory from now on
+    assert matches_of(engine, small[2]) == sorted([*ids, lost])  # held in memory from now on
     until(lambda: events and (events[-1].kind, events[-1].frame_id) == ("frame.indexed", lost))
     primary.kill()
     with pytest.raises(StoreAway):
@@ -94,8 +94,8 @@ def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
         engine.get_frame("hall", lost)
     other = index(engine, small[3])  # which is given the number and the revision of the lost one
     assert engine.get_map("hall").frames == {"indexed": 3}
-    assert found(engine, small[3]) == sorted([*kept, other])
+    assert matches_of(engine, small[3]) == sorted([*ids, other])
     until(lambda: events and (events[-1].kind, events[-1].frame_id) == ("frame.indexed", other))
     assert [one.kind for one in events].count("events.missed") == 1
     again = index(engine, small[2])  # as by a robot that keeps its frames for a while
-    assert found(engine, small[2]) == sorted([*kept, other, again])
+    assert matches_of(engine, small[2]) == sorted([*ids, other, again])

@@ -53,15 +53,15 @@ def test_a_deadlock_of_two_costs_none_of_those_written_with_them(server_store, r
     ]
     groups = [Grouping(database, row.number) for row in rows[:2]]
     with ThreadPoolExecutor(6) as pool:
-        found = []
+        results = []
         with database.write():  # until this is over nobody else writes
             for group, three in zip(groups, works, strict=True):
                 for work in three:
                     before = len(group._waiting)
-                    found.append(pool.submit(run, group, work))
+                    results.append(pool.submit(run, group, work))
                     while len(group._waiting) == before:
                         pass
-        came = [one.result(PATIENCE_S) for one in found]
+        came = [one.result(PATIENCE_S) for one in results]
     assert [came[2], came[5]] == ["done", "done"]
     assert len(tries) > 4  # there was a deadlock, and those of one group were written again
 

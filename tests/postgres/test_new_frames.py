@@ -19,15 +19,15 @@ from sceneprint.store.tables import frames, idempotency, jobs, maps, pending_eve
 from tests.store.frame_rows import frame_values
 
 
-def new(row, content, **given):
-    own = {name: given.pop(name) for name in ("priority", "result") if name in given}
-    return NewFrame(row, frame_values(f"{content:064x}", **given), **own)
+def new(row, content, **fields):
+    own = {name: fields.pop(name) for name in ("priority", "result") if name in fields}
+    return NewFrame(row, frame_values(f"{content:064x}", **fields), **own)
 
 
-def receive(database, *given, wait_s=10.0):
-    with database.write_maps({one.row.number for one in given}, wait_s) as connection:
-        ids = receive_frames(connection, given)
-    return [one.frame_id in ids for one in given]
+def receive(database, *args, wait_s=10.0):
+    with database.write_maps({one.row.number for one in args}, wait_s) as connection:
+        ids = receive_frames(connection, args)
+    return [one.frame_id in ids for one in args]
 
 
 def counted(database):
@@ -48,23 +48,23 @@ def content_of(database):
 
 def test_frames_of_several_maps_are_taken_in_their_order(server_store, rows):
     database, (a, b, c) = server_store.database, rows
-    given = [new(c, 5), new(a, 9), new(b, 9, bytes=77), new(a, 1), new(c, 4)]
-    assert receive(database, *given) == [True] * 5
+    incoming = [new(c, 5), new(a, 9), new(b, 9, bytes=77), new(a, 1), new(c, 4)]
+    assert receive(database, *incoming) == [True] * 5
     assert content_of(database) == [
-        (one.row.number, one.values["content_id"], one.job_id) for one in given
+        (one.row.number, one.values["content_id"], one.job_id) for one in incoming
     ]
     assert counted(database) == [("a", 2, 6), ("b", 1, 77), ("c", 2, 6)]
     with database.read() as connection:
         pending = connection.execute(select(pending_events).order_by(pending_events.c.number))
         assert [(one.map, one.frame_id, one.job_id) for one in pending] == [
-            (one.row.name, one.frame_id, one.job_id) for one in given
+            (one.row.name, one.frame_id, one.job_id) for one in incoming
         ]
 
 
 def test_a_cloud_has_no_intrinsics(server_store, rows):
     """They are null as JSON has it: the column takes no other."""
-    given = [new(rows[0], 1), new(rows[0], 2, intrinsics=None)]
-    assert receive(server_store.database, *given) == [True, True]
+    incoming = [new(rows[0], 1), new(rows[0], 2, intrinsics=None)]
+    assert receive(server_store.database, *incoming) == [True, True]
     with server_store.database.read() as connection:
         query = text("SELECT CAST(intrinsics AS text), pose IS NULL FROM frames ORDER BY number")
         assert [tuple(one) for one in connection.execute(query)] == [
@@ -75,10 +75,10 @@ def test_a_cloud_has_no_intrinsics(server_store, rows):
 def test_what_is_there_or_comes_twice_is_taken_once(server_store, rows):
     database, (a, b, _) = server_store.database, rows
     assert receive(database, new(a, 1)) == [True]
-    given = [new(a, 2), new(a, 1), new(b, 1), new(a, 2), new(a, 3)]
-    assert receive(database, *given) == [True, False, True, False, True]
+    incoming = [new(a, 2), new(a, 1), new(b, 1), new(a, 2), new(a, 3)]
+    assert receive(database, *incoming) == [True, False, True, False, True]
     assert counted(database)[:2] == [("a", 3, 9), ("b", 1, 3)]
-    assert receive(database, *given) == [False] * 5
+    assert receive(database, *incoming) == [False] * 5
 
 
 @pytest.mark.parametrize(
@@ -108,9 +108,9 @@ def test_what_was_done_under_its_key_is_not_done_again(server_store, rows):
         return request.columns({"frames": request.key})
 
     assert receive(database, new(a, 1, result=kept(requests[0]))) == [True]
-    given = [new(b, 2, result=kept(request)) for request in requests[:1]]
-    given += [new(b, 3), new(a, 3, result=kept(requests[1]))]
-    assert receive(database, *given) == [False, True, True]
+    incoming = [new(b, 2, result=kept(request)) for request in requests[:1]]
+    incoming += [new(b, 3), new(a, 3, result=kept(requests[1]))]
+    assert receive(database, *incoming) == [False, True, True]
     with database.read() as connection:
         assert requests[1].stored_result(connection) == {"frames": "new"}
         assert len(connection.execute(select(idempotency.c.key)).all()) == 2
@@ -154,53 +154,53 @@ def test_maps_are_locked_in_one_order(server_store, rows, until, waiting):
     assert {name: n for name, n, _ in counted(database) if n} == {"a": 1, last.name: 1}
 
 
-def together(group, given, until):
+def together(group, incoming, until):
     """What came of frames that all waited for one statement."""
     group._led = True  # somebody writes
-    with ThreadPoolExecutor(len(given)) as pool:
-        begun = [pool.submit(group.receive, one) for one in given]
-        until(lambda: len(group._waiting) == len(given))
+    with ThreadPoolExecutor(len(incoming)) as pool:
+        begun = [pool.submit(group.receive, one) for one in incoming]
+        until(lambda: len(group._waiting) == len(incoming))
         leader = group._waiting[0]
         leader.leads = True
         leader.ready.set()
-        found = [one.exception() or one.result() for one in begun]
+        outcomes = [one.exception() or one.result() for one in begun]
     assert (group._waiting, group._led) == ([], False)
-    return found
+    return outcomes
 
 
 def test_frames_of_many_threads_are_taken_once(server_store, rows, until, monkeypatch):
     database = server_store.database
     monkeypatch.setattr(write_groups, "MOST_TOGETHER", 5)  # two transactions
-    given = [new(rows[i % 3], i // 2) for i in range(8)] + [new(rows[0], 0)]
-    found = together(NewFrames(database), given, until)
-    assert sum(found) == sum(one[1] for one in counted(database)) == 8
+    incoming = [new(rows[i % 3], i // 2) for i in range(8)] + [new(rows[0], 0)]
+    outcomes = together(NewFrames(database), incoming, until)
+    assert sum(outcomes) == sum(one[1] for one in counted(database)) == 8
     with database.read() as connection:
         assert set(connection.execute(select(frames.c.id)).scalars()) == {
-            one.frame_id for one, taken in zip(given, found, strict=True) if taken
+            one.frame_id for one, taken in zip(incoming, outcomes, strict=True) if taken
         }
 
 
 def test_one_that_cannot_be_written_sends_all_on_alone(server_store, rows, until):
-    given = [new(rows[0], 1), new(rows[1], 2, sequence=2**80), new(rows[2], 3)]
-    assert together(NewFrames(server_store.database), given, until) == [False] * 3
+    incoming = [new(rows[0], 1), new(rows[1], 2, sequence=2**80), new(rows[2], 3)]
+    assert together(NewFrames(server_store.database), incoming, until) == [False] * 3
     assert [one[1] for one in counted(server_store.database)] == [0, 0, 0]
 
 
 def test_a_map_in_use_sends_all_on_alone(server_store, rows, until, monkeypatch):
     monkeypatch.setattr(write_groups, "MAPS_WAIT_S", 0.05)
-    given = [new(rows[0], 1), new(rows[1], 2)]
+    incoming = [new(rows[0], 1), new(rows[1], 2)]
     with in_use(server_store.database, rows[1]):
-        found = together(NewFrames(server_store.database), given, until)
-    assert found == [False, False]
+        outcomes = together(NewFrames(server_store.database), incoming, until)
+    assert outcomes == [False, False]
 
 
 def test_a_store_that_cannot_be_used_is_told_to_all(server_store, rows, until, monkeypatch):
     monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
-    given = [new(rows[0], 1), new(rows[1], 2)]
+    incoming = [new(rows[0], 1), new(rows[1], 2)]
     with server_store.database._writers.begin() as other:
         take_turn(other, 10.0)
-        found = together(NewFrames(server_store.database), given, until)
-    assert [type(one) for one in found] == [StoreLocked, StoreLocked]
+        outcomes = together(NewFrames(server_store.database), incoming, until)
+    assert [type(one) for one in outcomes] == [StoreLocked, StoreLocked]
 
 
 def test_a_statement_that_was_prepared_in_vain_is_prepared_again(server_store, rows):

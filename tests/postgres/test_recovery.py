@@ -27,9 +27,9 @@ def recover(*arguments, options=""):
     """Run the script as who runs PostgreSQL."""
     path = f"{binaries()}:{os.environ['PATH']}"
     command = [*nobody_prefix(), "env", f"PATH={path}", f"PGOPTS={options}", "bash", str(SCRIPT)]
-    given = [*command, *map(str, arguments)]
+    args = [*command, *map(str, arguments)]
     return subprocess.run(
-        given, capture_output=True, text=True, timeout=PATIENCE_S, cwd="/", check=False
+        args, capture_output=True, text=True, timeout=PATIENCE_S, cwd="/", check=False
     )
 
 

@@ -100,8 +100,8 @@ def held(object_server):
 @pytest.fixture
 def engine(postgres_url, bucket, tmp_path):
     """A service of the fleet; it has its own way to the object store."""
-    given = {"database_url": postgres_url, "blob_url": bucket, "data_dir": tmp_path}
-    with Engine(Settings.model_validate(given)) as opened:
+    settings = {"database_url": postgres_url, "blob_url": bucket, "data_dir": tmp_path}
+    with Engine(Settings.model_validate(settings)) as opened:
         opened.create_map(NewMap(name="hall"))
         yield opened
 
@@ -155,8 +155,8 @@ def alone(engine, small):
 
 
 def in_a_group(engine, small):
-    found, _ = engine.uploads.add_all("hall", [Upload(*one) for one in small[:2]])
-    return found
+    result, _ = engine.uploads.add_all("hall", [Upload(*one) for one in small[:2]])
+    return result
 
 
 def test_an_upload_does_not_wait_for_a_removal(engine, small, held, removal):
@@ -370,8 +370,8 @@ def test_a_request_without_an_answer_may_be_carried_out_later(
 
 def test_an_upload_waits_for_a_removal_of_files(small, postgres_url, tmp_path, until, monkeypatch):
     """The removal continues after its transaction, and its disk may stall."""
-    given = Settings.model_validate({"database_url": postgres_url, "data_dir": tmp_path})
-    given.blobs.mkdir()
+    settings = Settings.model_validate({"database_url": postgres_url, "data_dir": tmp_path})
+    settings.blobs.mkdir()
     arrived, passes = threading.Event(), threading.Event()
     remove = FolderBlobs.remove
 
@@ -380,7 +380,7 @@ def test_an_upload_waits_for_a_removal_of_files(small, postgres_url, tmp_path, u
         passes.wait(PATIENCE_S)
         remove(self, *digests)
 
-    with Engine(given) as engine, closing(open_store(postgres_url, given.blobs)) as remover:
+    with Engine(settings) as engine, closing(open_store(postgres_url, settings.blobs)) as remover:
         engine.create_map(NewMap(name="hall"))
         digest = engine.store.blobs.put(small[0].png)
         monkeypatch.setattr(FolderBlobs, "remove", stall)

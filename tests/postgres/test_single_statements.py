@@ -99,8 +99,8 @@ def rows(store, row):
 
 
 def _told(connection, table, of):
-    found = connection.execute(select(table).where(of).order_by(*table.primary_key)).mappings()
-    return [{name: one[name] for name in one if name not in CHANCE} for one in found]
+    result = connection.execute(select(table).where(of).order_by(*table.primary_key)).mappings()
+    return [{name: one[name] for name in one if name not in CHANCE} for one in result]
 
 
 def test_a_frame_is_received_as_by_its_parts(server_store, pair):

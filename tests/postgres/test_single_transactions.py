@@ -59,8 +59,8 @@ def test_it_is_committed_with_its_answer_and_keeps_no_turn(server_store, row):
     database = server_store.database
     query = text(str(LOCKS_HELD).replace("count(*)", "mode") + " AND pid = pg_backend_pid()")
     with database.write(map_number=row.number, single=True) as connection:
-        found = connection.execute(query).scalars().all()  # it had its turn, and its map alone
-        assert sorted(found) == ["ExclusiveLock", "ShareLock"]
+        rows = connection.execute(query).scalars().all()  # it had its turn, and its map alone
+        assert sorted(rows) == ["ExclusiveLock", "ShareLock"]
         assert locks(server_store) == 0
     with database.write(map_number=row.number, single=True) as connection:
         connection.execute(update(maps).values(name="at once"))
@@ -147,8 +147,8 @@ def test_a_connection_that_was_ended_a_moment_ago_is_not_used(server_store, row)
 @pytest.fixture
 def engine(postgres_url, tmp_path):
     (tmp_path / "blobs").mkdir()
-    given = {"database_url": postgres_url, "data_dir": tmp_path}
-    with Engine(Settings.model_validate(given)) as opened:
+    settings = {"database_url": postgres_url, "data_dir": tmp_path}
+    with Engine(Settings.model_validate(settings)) as opened:
         opened.create_map(NewMap(name="hall"))
         yield opened
 

@@ -22,8 +22,8 @@ def depth():
 
     def samples(i):
         rng = np.random.default_rng(i)
-        found = rng.integers(800, 6000, (60, 80)).astype(np.uint16)
-        found[rng.random(found.shape) < 0.1] = 0
-        return found
+        result = rng.integers(800, 6000, (60, 80)).astype(np.uint16)
+        result[rng.random(result.shape) < 0.1] = 0
+        return result
 
     return samples

@@ -221,7 +221,7 @@ def test_odometry_with_more_messages_is_used_and_the_other_is_named(tmp_path, ro
 def test_transforms_come_before_odometry_of_the_same_frames(tmp_path, ros, walk, depth):
     """Wheels slip: what a filter makes of their odometry is in tf."""
 
-    found = []
+    results = []
     for name in ("with", "without"):
 
         def put(writer, i, t, name=name):
@@ -230,9 +230,9 @@ def test_transforms_come_before_odometry_of_the_same_frames(tmp_path, ros, walk,
             writer.image(t + 0.03, depth(i))
 
         path = ros.write(tmp_path / name, partial(drive, ros=ros, walk=walk, put=put))
-        found.append([frame.pose for frame in only(path).frames])
-    assert len(found[0]) == len(walk) - 1  # the last lies 30 ms after the last transform
-    np.testing.assert_array_equal(found[0], found[1])
+        results.append([frame.pose for frame in only(path).frames])
+    assert len(results[0]) == len(walk) - 1  # the last lies 30 ms after the last transform
+    np.testing.assert_array_equal(results[0], results[1])
 
 
 @pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])

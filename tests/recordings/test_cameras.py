@@ -36,10 +36,10 @@ def test_each_frame_has_the_camera_info_of_its_time(way, container, tmp_path, ro
                 writer.camera_info(t, k=(0.0, 0.0, 0.0, 0.0))
             writer.late = 0.0
 
-    (found,) = find_sequences(ros.write(tmp_path, fill, container), ALL)
-    focal = [frame.camera.intrinsics.fx for frame in found.frames if frame.camera]
+    (sequence,) = find_sequences(ros.write(tmp_path, fill, container), ALL)
+    focal = [frame.camera.intrinsics.fx for frame in sequence.frames if frame.camera]
     assert focal == [70.0] * 4 + [50.0] * 4
-    assert found.note.endswith(
+    assert sequence.note.endswith(
         "2 cameras, because the camera info changes: each frame has the camera of its time"
     )
 
@@ -54,8 +54,8 @@ def test_a_camera_info_of_another_run_is_not_that_of_this_one(tmp_path, ros):
                 writer.image(1.0 + 0.2 * i + 0.1 * run, IMAGE)
                 writer.camera_info(1.0 + 0.2 * i + 0.1 * run, k=(f, f, 39.5, 29.5))
 
-    found = find_sequences(ros.write(tmp_path, fill), ALL)
-    focal = [[f.camera.intrinsics.fx for f in each.frames if f.camera] for each in found]
+    sequences = find_sequences(ros.write(tmp_path, fill), ALL)
+    focal = [[f.camera.intrinsics.fx for f in each.frames if f.camera] for each in sequences]
     assert focal == [[70.0] * 4, [50.0] * 4]
 
 
@@ -89,8 +89,8 @@ def test_rvl_by_hand():
     digits = [int(part) for part in groups.replace("|", "").split()]
     nibbles = [digit | (0 if i in ends else 8) for i, digit in enumerate(digits)] + [0] * 5
     words = [int("".join(f"{nibble:x}" for nibble in nibbles[i : i + 8]), 16) for i in (0, 8)]
-    found = rvl_samples(struct.pack("<IIII", 3, 2, *words))
-    assert found.tolist() == [[0, 0, 1000], [1001, 990, 0]]
+    result = rvl_samples(struct.pack("<IIII", 3, 2, *words))
+    assert result.tolist() == [[0, 0, 1000], [1001, 990, 0]]
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
@@ -156,8 +156,8 @@ def test_png_of_16_bits(form, tmp_path, ros):
         writer.camera_info(0.0)
         writer.compressed(0.0, IMAGE, form=form, topic=topic)
 
-    (found,) = find_sequences(ros.write(tmp_path, fill), ALL)
-    np.testing.assert_array_equal(found.frames[0].read_depth().depth, np.float32(2))
+    (sequence,) = find_sequences(ros.write(tmp_path, fill), ALL)
+    np.testing.assert_array_equal(sequence.frames[0].read_depth().depth, np.float32(2))
 
 
 def test_metres_have_no_depth_scale(tmp_path, ros):

@@ -165,8 +165,8 @@ def test_images_of_absurd_sizes(container, tmp_path, ros, depth):
             writer.raw("/camera/depth/image_raw", name, 0.1 + 0.1 * number, data)
 
     path = ros.write(tmp_path, fill, container)
-    found = find_sequences(path, RecordingOptions(keyframe_s=0))  # some stamps go back
-    by_name = {frame.name[-2:]: frame for sequence in found for frame in sequence.frames}
+    sequences = find_sequences(path, RecordingOptions(keyframe_s=0))  # some stamps go back
+    by_name = {frame.name[-2:]: frame for sequence in sequences for frame in sequence.frames}
     assert len(by_name) == 18
     assert by_name.pop("00").read().depth.any()
     for frame in by_name.values():

@@ -67,9 +67,9 @@ def check_walls(sequence, tolerance):
         scans = range(frame.sequence, max(frame.sequence - 21, -1), -1)
         world = np.concatenate([wall(number) for number in scans])
         T = np.linalg.inv(frame.pose)
-        found = frame.read().points
-        assert len(found) == len(world)
-        assert np.abs(found - (world @ T[:3, :3].T + T[:3, 3])).max() < tolerance
+        points = frame.read().points
+        assert len(points) == len(world)
+        assert np.abs(points - (world @ T[:3, :3].T + T[:3, 3])).max() < tolerance
 
 
 @pytest.mark.parametrize(

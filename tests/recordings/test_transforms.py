@@ -46,15 +46,15 @@ def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path
                     writer.odometry(1 + 0.5 * i, T)
                 writer.image(1.2 + 0.5 * i, IMAGE)
 
-    found = sequences(ros, tmp_path, fill, MOUNTING, container=container)
-    assert [one.name for one in found] == ["run.part1", "run.part2", "run.part3"]
-    assert [one.parent_frame for one in found] == [f"run.part{i}/odom" for i in (1, 2, 3)]
+    runs = sequences(ros, tmp_path, fill, MOUNTING, container=container)
+    assert [one.name for one in runs] == ["run.part1", "run.part2", "run.part3"]
+    assert [one.parent_frame for one in runs] == [f"run.part{i}/odom" for i in (1, 2, 3)]
     # the last frame of each run lies after its last sample, and not before those of the next run
-    assert [positions(one) for one in found] == [
+    assert [positions(one) for one in runs] == [
         [[0.4 + i, 10.0 * run, 0.0] for i in range(last - 1)] for run, last in enumerate((4, 3, 6))
     ]
-    assert [frame.name for frame in found[1].frames] == ["run.part2/000004", "run.part2/000005"]
-    assert found[0].note == (
+    assert [frame.name for frame in runs[1].frames] == ["run.part2/000004", "run.part2/000005"]
+    assert runs[0].note == (
         "10 of 13 frames of /camera/depth/image_raw used, poses of 10 of 13 frames in odom; 3 "
         "without: no sample of odom -> base_link within 20 ms (nearest 0.2 s); skipped: 3 without "
         "a pose; split into 3 parts, because stamps jump back"
@@ -69,8 +69,8 @@ def test_stamps_that_are_out_of_order_by_little_split_nothing(tmp_path, ros):
             writer.transforms(t, {("odom", "base_link"): ros.transform(0.1 * i, 0, 0)})
             writer.image(t, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
-    assert sorted(positions(found)) == [[round(0.1 * i, 6), 0, 0] for i in range(5)]
+    (sequence,) = sequences(ros, tmp_path, fill, MOUNTING)
+    assert sorted(positions(sequence)) == [[round(0.1 * i, 6), 0, 0] for i in range(5)]
 
 
 def test_two_publishers_with_delays_of_their_own_split_nothing(tmp_path, ros):
@@ -85,8 +85,8 @@ def test_two_publishers_with_delays_of_their_own_split_nothing(tmp_path, ros):
             writer.late = 0.0
             writer.image(0.1 * i, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
-    assert positions(found) == [[round(0.1 * i, 6), 0, 0] for i in range(40)]
+    (sequence,) = sequences(ros, tmp_path, fill, MOUNTING)
+    assert positions(sequence) == [[round(0.1 * i, 6), 0, 0] for i in range(40)]
 
 
 @pytest.mark.parametrize(
@@ -95,8 +95,8 @@ def test_two_publishers_with_delays_of_their_own_split_nothing(tmp_path, ros):
 def test_two_publishers_that_contradict_each_other(period, order, tmp_path, ros):
     def fill(writer):
         for i in range(36):
-            t, who = period * i, order[i % len(order)]
-            T = ros.transform(0.2 * t, 0.0 if who == "A" else 8.0, 0)
+            t, robot = period * i, order[i % len(order)]
+            T = ros.transform(0.2 * t, 0.0 if robot == "A" else 8.0, 0)
             writer.transforms(t, {("odom", "base_link"): T})
             if i:
                 writer.image(t - 0.3 * period, IMAGE)
@@ -120,12 +120,12 @@ def test_frames_within_a_jump_are_left_out(tmp_path, ros):
             if i:
                 writer.image(0.1 * i - 0.05, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
+    (sequence,) = sequences(ros, tmp_path, fill, MOUNTING)
     middle = [[round((a + b) / 2, 6), 0, 0] for a, b in pairwise(x)]
-    assert positions(found) == [*middle[:3], *middle[4:]]
-    assert "1 without: samples of odom -> base_link contradict each other" in found.note
-    assert "skipped: 1 without a pose" in found.note
-    assert "odom -> base_link jumps by 20 m or rad" in found.note
+    assert positions(sequence) == [*middle[:3], *middle[4:]]
+    assert "1 without: samples of odom -> base_link contradict each other" in sequence.note
+    assert "skipped: 1 without a pose" in sequence.note
+    assert "odom -> base_link jumps by 20 m or rad" in sequence.note
 
 
 def test_samples_at_the_stamps_of_frames_are_too_fast(tmp_path, ros):
@@ -136,10 +136,10 @@ def test_samples_at_the_stamps_of_frames_are_too_fast(tmp_path, ros):
             writer.transforms(1.0 * i, {("odom", "base_link"): ros.transform(at, 0, 0)})
             writer.image(1.0 * i, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
-    assert positions(found) == [[at, 0, 0] for at in (200.0, 201.0, 202.0)]
-    assert "3 without: samples of odom -> base_link contradict each other" in found.note
-    assert found.lost == 3
+    (sequence,) = sequences(ros, tmp_path, fill, MOUNTING)
+    assert positions(sequence) == [[at, 0, 0] for at in (200.0, 201.0, 202.0)]
+    assert "3 without: samples of odom -> base_link contradict each other" in sequence.note
+    assert sequence.lost == 3
 
 
 @pytest.mark.parametrize(
@@ -165,9 +165,9 @@ def test_frames_that_miss_the_poses_of_the_recording_are_lost(
         for i in range(3):
             writer.odometry(i + shift_s, ros.transform(1.0 * i, 0, 0), child=child)
 
-    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
-    assert found.lost == len(found.frames) == 3
-    assert why in found.note
+    (sequence,) = sequences(ros, tmp_path, fill, MOUNTING)
+    assert sequence.lost == len(sequence.frames) == 3
+    assert why in sequence.note
 
 
 @pytest.mark.parametrize("length", [0.0, 0.5, 1.02, float("nan")])
@@ -178,18 +178,18 @@ def test_quaternions_that_are_not_of_length_1(length, tmp_path, ros):
             writer.odometry(0.1 * i, ros.transform(float(i), 0, 0))
             writer.image(0.1 * i, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill)
+    (sequence,) = sequences(ros, tmp_path, fill)
     if length == 1.02:
-        assert found.note.endswith(
+        assert sequence.note.endswith(
             "base_link -> camera is normalised: its quaternion has the length 1.02"
         )
         expected = ros.transform(2, 0, 0) @ ros.camera
-        np.testing.assert_allclose(found.frames[2].pose, expected, atol=1e-9)
-        assert found.lost == 0
+        np.testing.assert_allclose(sequence.frames[2].pose, expected, atol=1e-9)
+        assert sequence.lost == 0
     else:
-        assert found.lost == 3
-        assert [frame.pose for frame in found.frames] == [None] * 3
-        assert found.note.endswith(
+        assert sequence.lost == 3
+        assert [frame.pose for frame in sequence.frames] == [None] * 3
+        assert sequence.note.endswith(
             "poses of 0 of 3 frames; 3 without: there are no transforms from camera to a frame in "
             "which it moves; base_link -> camera is ignored because its quaternion has the length "
             f"{length:.3g}"
@@ -205,9 +205,9 @@ def test_a_fixed_transform_with_two_values_is_passed_over(other, tmp_path, ros):
             writer.odometry(0.1 * i, ros.transform(float(i), 0, 0))
             writer.image(0.1 * i, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill)
-    assert [frame.pose for frame in found.frames] == [None] * 3
-    assert found.note.endswith(
+    (sequence,) = sequences(ros, tmp_path, fill)
+    assert [frame.pose for frame in sequence.frames] == [None] * 3
+    assert sequence.note.endswith(
         "base_link -> camera is ignored because it is static, but has values that differ by 0.3 m "
         "or rad"
     )
@@ -237,17 +237,17 @@ SEEN = np.array([[4.0 + 0.2 * i, i % 3 - 1.0, 0.1 * i] for i in range(12)])
 
 @pytest.mark.parametrize("frame", ["camera_init", "odom", "start"])
 def test_registered_clouds_are_taken_back_to_their_sensor(frame, tmp_path, ros):
-    (found,) = sequences(
+    (sequence,) = sequences(
         ros, tmp_path, lambda writer: registered(ros, writer, frame=frame, tf="yes")
     )
-    assert found.parent_frame == f"run/{frame}"
-    assert found.note.endswith(f"; points are transformed from {frame} to their sensor, lidar")
-    for i, one in enumerate(found.frames):
+    assert sequence.parent_frame == f"run/{frame}"
+    assert sequence.note.endswith(f"; points are transformed from {frame} to their sensor, lidar")
+    for i, one in enumerate(sequence.frames):
         np.testing.assert_allclose(one.read().points, SEEN, atol=1e-5)
         T = ros.transform(3.0 * i, 0.5 * i, 1, 0, 0, np.sin(0.2 * i), np.cos(0.2 * i))
         np.testing.assert_allclose(one.pose, T @ ros.transform(0.1, 0, 0.4), atol=1e-9)
-    travelled = pickle.loads(pickle.dumps(found.frames[3]))
-    assert travelled.read_bytes() == found.frames[3].read_bytes()
+    travelled = pickle.loads(pickle.dumps(sequence.frames[3]))
+    assert travelled.read_bytes() == sequence.frames[3].read_bytes()
 
 
 def test_registered_clouds_of_an_unknown_sensor_are_refused(tmp_path, ros):
@@ -259,8 +259,8 @@ def test_registered_clouds_of_an_unknown_sensor_are_refused(tmp_path, ros):
     )
     with pytest.raises(DatasetError, match="Select one of camera, lidar with --sensor-frame"):
         find_sequences(two, ALL)
-    (found,) = find_sequences(two, RecordingOptions(keyframe_m=0, sensor_frame="lidar"))
-    np.testing.assert_allclose(found.frames[2].read().points, SEEN, atol=1e-5)
+    (sequence,) = find_sequences(two, RecordingOptions(keyframe_m=0, sensor_frame="lidar"))
+    np.testing.assert_allclose(sequence.frames[2].read().points, SEEN, atol=1e-5)
     with pytest.raises(DatasetError, match="'wheel' is not below"):
         find_sequences(two, RecordingOptions(sensor_frame="wheel"))
 
@@ -273,6 +273,6 @@ def test_points_in_the_base_of_a_robot_with_an_arm_stay_there(tmp_path, ros):
             writer.transforms(0.1 * i, {("base_link", "hand"): ros.transform(0.1 * i, 0, 1)})
             writer.points(0.1 * i, rows, frame="base_link")
 
-    (found,) = sequences(ros, tmp_path, fill)
-    assert [frame.pose for frame in found.frames] == [None] * 3
-    np.testing.assert_array_equal(found.frames[2].read().points, np.ones((12, 3)))
+    (sequence,) = sequences(ros, tmp_path, fill)
+    assert [frame.pose for frame in sequence.frames] == [None] * 3
+    np.testing.assert_array_equal(sequence.frames[2].read().points, np.ones((12, 3)))

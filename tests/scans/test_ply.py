@@ -57,8 +57,8 @@ def test_numbers_written_out():
     ]  # fmt: skip
     rows = "".join(f"{word} 0 1\n\n" for word in words)
     header = f"ply\nformat ascii 1.0\nelement vertex {len(words)}\n{XYZ}end_header\n"
-    found = decode_cloud((header + rows).encode()).points[:, 0]
-    np.testing.assert_array_equal(found, np.array([float(w) for w in words], np.float32))
+    result = decode_cloud((header + rows).encode()).points[:, 0]
+    np.testing.assert_array_equal(result, np.array([float(w) for w in words], np.float32))
 
     missing = ["nan", "-nan", "NaN(ind)", "inf", "-Infinity", "1.#QNAN", "-1.#IND", "1e400"]
     rows += "".join(f"{word} 0 1\n" for word in missing)

@@ -87,12 +87,12 @@ def test_thinned_as_one_would_by_hand():
     points[rng.integers(0, 3000, 500)] = points[7]
     points[0] = (-10_000.0, 10_000.0, 10_000.0)
     for most in (8, 60, 700, 2400):
-        found, edge = thinned(points, most)
+        actual, edge = thinned(points, most)
         firsts = {}
         for i, voxel in enumerate(np.floor(points.astype(float) * (1.0 / edge)).astype(int)):
             firsts.setdefault(tuple(voxel.tolist()), i)
-        np.testing.assert_array_equal(found, points[sorted(firsts.values())])
-        assert len(found) <= most
+        np.testing.assert_array_equal(actual, points[sorted(firsts.values())])
+        assert len(actual) <= most
         if edge > 0.01:  # and with the voxels before it, there would have been too many
             finer = np.floor(points.astype(float) * (np.sqrt(2.0) / edge))
             assert len(np.unique(finer, axis=0)) > most

@@ -385,17 +385,17 @@ def test_a_cloud_of_too_many_points_is_thinned_while_it_is_read():
     rng = np.random.default_rng(3)
     points = rng.uniform((-20, -15, 0), (20, 15, 5), (50_000, 3)) + np.array([5e5, 4e6, 0])
     blocks = np.array_split(points, 13)
-    found, origin, voxel = gather(iter(blocks), len(points), lambda _: 1.0, most=4000)
+    actual, origin, voxel = gather(iter(blocks), len(points), lambda _: 1.0, most=4000)
     assert voxel is not None
-    assert 1000 < len(found) <= 4000
+    assert 1000 < len(actual) <= 4000
     # one point to a voxel, each a point of the file, and no voxel of the file is lost but few
-    cells = np.floor(found / voxel).astype(int)
-    assert len(np.unique(cells, axis=0)) == len(found)
-    back = found.astype(np.float64) + origin
+    cells = np.floor(actual / voxel).astype(int)
+    assert len(np.unique(cells, axis=0)) == len(actual)
+    back = actual.astype(np.float64) + origin
     nearest = [np.abs(points - one).max(axis=1).min() for one in back[::50]]
     assert max(nearest) < 1e-5
     whole = np.unique(np.floor((points - origin) / voxel).astype(int), axis=0)
-    assert len(found) > 0.9 * len(whole)
+    assert len(actual) > 0.9 * len(whole)
     # the same file gives the same points
     other, _, _ = gather(iter(blocks), len(points), lambda _: 1.0, most=4000)
-    np.testing.assert_array_equal(found, other)
+    np.testing.assert_array_equal(actual, other)

@@ -28,9 +28,9 @@ def test_times_of_drivers(name, kind, unit, epoch, points, ros):
     rows["x"][3] = np.nan
     writer = ros.messages()
     writer.points(1.5, rows)
-    found, seconds = timed_points(writer.last())
+    actual, seconds = timed_points(writer.last())
     rest = np.arange(12) != 3
-    np.testing.assert_array_equal(found, points[rest] + 10)
+    np.testing.assert_array_equal(actual, points[rest] + 10)
     assert seconds is not None
     np.testing.assert_allclose(seconds, SECONDS[rest], atol=1e-6)
 
@@ -49,8 +49,8 @@ def test_times_that_no_scan_takes_are_ignored(step, points, ros):
     rows["x"], rows["time"] = 1.0, step * np.arange(12)
     writer = ros.messages()
     writer.points(1.5, rows)
-    found, seconds = timed_points(writer.last())
-    assert len(found) == 12
+    actual, seconds = timed_points(writer.last())
+    assert len(actual) == 12
     assert seconds is None
 
 
@@ -74,8 +74,8 @@ def test_livox_scans_are_read_as_rosbags_wrote_them(serialization, frame, packag
     data = livox_bytes(writer, serialization)
     scan = read_livox_scan(data, ros1=ros1)
     assert scan.header == ((ros.start + 2, 250_000_000), frame)
-    found, seconds = timed_points(scan)
-    np.testing.assert_array_equal(found, (points + 10)[rest])
+    actual, seconds = timed_points(scan)
+    np.testing.assert_array_equal(actual, (points + 10)[rest])
     np.testing.assert_allclose(seconds, SECONDS[rest], atol=1e-9)
     np.testing.assert_array_equal(cloud_points(scan), (points + 10)[rest])
     for end in range(len(data)):
@@ -94,5 +94,5 @@ def test_other_messages_are_no_livox_scans(points, ros):
     with pytest.raises(UnreadableCloud, match="declares 11 points, but holds 12"):
         read_livox_scan(livox_bytes(writer, "little"))
     writer.livox(0.0, points[:0], SECONDS[:0])
-    found, seconds = timed_points(read_livox_scan(livox_bytes(writer, "little")))
-    assert (len(found), seconds) == (0, None)
+    actual, seconds = timed_points(read_livox_scan(livox_bytes(writer, "little")))
+    assert (len(actual), seconds) == (0, None)

@@ -40,7 +40,7 @@ FLEET = "https://fleet.example"
 
 def members(group):
     """Return the running processes of a group."""
-    found = []
+    results = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:
@@ -48,8 +48,8 @@ def members(group):
             except (OSError, ValueError):
                 continue
             if int(pgrp) == group and state != "Z":
-                found.append(int(entry.name))
-    return found
+                results.append(int(entry.name))
+    return results
 
 
 @dataclass
@@ -227,9 +227,9 @@ class Shot:
 
     def form(self, **meta):
         """Return the arguments of a request that uploads the frame."""
-        known = {"intrinsics": self.camera, **meta}
+        fields = {"intrinsics": self.camera, **meta}
         parts = {"frame": ("frame.png", self.png, "image/png")}
-        return {"files": parts, "data": {"meta": json.dumps(known)}}
+        return {"files": parts, "data": {"meta": json.dumps(fields)}}
 
 
 @pytest.fixture(scope="session")
@@ -257,15 +257,15 @@ def shots(room_frames, shoot):
 @pytest.fixture(scope="session")
 def small_shots(room_frames, shoot):
     """96 small frames: every fourth sample from each of 16 offsets of each of six views."""
-    found = []
+    results = []
     for frame in room_frames:
         k = frame.intrinsics
         for place in range(16):
             y, x = divmod(place, 4)
             depth = np.ascontiguousarray(frame.depth[y::4, x::4])
             lens = Intrinsics(160, 120, k.fx / 4, k.fy / 4, (k.cx - x) / 4, (k.cy - y) / 4)
-            found.append(shoot(depth, lens))
-    return found
+            results.append(shoot(depth, lens))
+    return results
 
 
 @pytest.fixture(scope="session")
@@ -364,13 +364,13 @@ class House:
 @contextmanager
 def _opened(folder, url, keys, **more):
     (folder / "blobs").mkdir()
-    given = {
+    fields = {
         "data_dir": folder,
         "database_url": url,
         "require_keys": True,
         "tenant_requests_per_s": 0,
     }
-    app = create_app(Settings.model_validate(given | more))
+    app = create_app(Settings.model_validate(fields | more))
     with (
         start_blocking_portal() as portal,
         portal.wrap_async_context_manager(app.router.lifespan_context(app)),

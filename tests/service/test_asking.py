@@ -20,19 +20,19 @@ def shots(small_shots):
 @pytest.fixture(scope="module")
 def maps(served, make_map, shots):
     """`ask-a` has two views of each of two rooms, `ask-b` one of each."""
-    found = {}
+    results = {}
     for name, views in (("ask-a", (0, 1, 3, 4)), ("ask-b", (0, 3))):
-        path, found[name] = make_map(served, name), []
+        path, results[name] = make_map(served, name), []
         for i in views:
             meta = {"session": f"room {i // 3}", "robot": "r1"}
-            found[name].append(served.index(path, shots[i], **meta))
-    return found
+            results[name].append(served.index(path, shots[i], **meta))
+    return results
 
 
 def body(answer, status=200):
     assert answer.status_code == status, answer.text
-    found = answer.json()
-    return {k: v for k, v in found.items() if k not in ("query_id", "milliseconds")}
+    page = answer.json()
+    return {k: v for k, v in page.items() if k not in ("query_id", "milliseconds")}
 
 
 def as_text(options):
@@ -66,8 +66,8 @@ def test_options_are_the_same_however_they_come(served, maps, shots):
     assert one["matches"][0]["validation"]["strength"] == "weak"
     own = maps["ask-a"][1]
     by_text, by_json = (
-        body(served.client.post("/v1/maps/ask-a/queries", json={"frame_id": own, **given}))
-        for given in (as_text(OPTIONS), OPTIONS)
+        body(served.client.post("/v1/maps/ask-a/queries", json={"frame_id": own, **options}))
+        for options in (as_text(OPTIONS), OPTIONS)
     )
     assert by_text == by_json
     assert by_json["frame"] == {"map": "ask-a", "frame_id": own}
@@ -114,10 +114,10 @@ def test_an_answer_lists_its_stages_and_is_counted_but_its_frame_is_not_kept(ser
     path, counted = "/v1/maps/ask-a", 'sceneprint_answers_total{status="unvalidated"}'
     before, figures = served.client.get(path).json(), figure(counted)
     answer = sent(served, f"{path}/queries", shots[2], {"stages": "retrieve"}, bare=False)
-    found = json.loads(answer.text, parse_constant=lambda text: pytest.fail(text))
+    page = json.loads(answer.text, parse_constant=lambda text: pytest.fail(text))
     stages = ["prepare", "retrieve", "diversify", "validate", "total"]
-    assert list(found["milliseconds"]) == stages
-    *parts, total = found["milliseconds"].values()
+    assert list(page["milliseconds"]) == stages
+    *parts, total = page["milliseconds"].values()
     assert sum(parts) == pytest.approx(total, abs=0.05)
     assert min(parts) >= 0
     after = served.client.get(path).json()

@@ -36,9 +36,9 @@ class Recorder:
         answer = self._client.request(method, pattern.format(**path), headers=headers, **more)
         assert answer.is_success, (name, answer.text)
         lines = self._client.get("/v1/audit", params={"limit": 1000}).json()["items"]
-        found = [line for line in reversed(lines) if line["request_id"] == request_id]
-        assert [one["action"] for one in found] == wanted, name
-        assert {one["address"] for one in found} <= {"127.0.0.1"}
+        result = [line for line in reversed(lines) if line["request_id"] == request_id]
+        assert [one["action"] for one in result] == wanted, name
+        assert {one["address"] for one in result} <= {"127.0.0.1"}
         self.tried.add(name)
         return answer
 

@@ -91,10 +91,10 @@ def test_a_form_that_is_none_is_refused(narrow, refused, name):
     headers = {"content-type": kind_of} if kind_of else {}
     reply = narrow.client.post("/v1/maps/hall/frames", content=body, headers=headers)
     refused(reply, status, kind, text)
-    assert kept(narrow.folder) == []
+    assert leftovers(narrow.folder) == []
 
 
-def kept(folder):
+def leftovers(folder):
     return [path for path in (folder / "blobs").rglob("*") if path.is_file()]
 
 
@@ -122,7 +122,7 @@ def test_a_stream_without_length_is_stopped_while_it_streams(narrow, wire, path)
     assert (status, headers["connection"]) == (413, "close")
     assert json.loads(body)["type"] == "/problems/too-large"
     assert narrow.client.get("/readyz").json()["frames"] == {}
-    assert kept(narrow.folder) == []
+    assert leftovers(narrow.folder) == []
 
 
 def test_what_is_as_large_as_may_be_is_read(narrow, refused):
@@ -157,7 +157,7 @@ def test_a_caller_who_hangs_up_leaves_nothing_behind(narrow, wire, small_shots):
     while not [line for line in narrow.log("request") if line["status"] == 499]:
         assert time.monotonic() < end
         time.sleep(0.02)
-    assert kept(narrow.folder) == []
+    assert leftovers(narrow.folder) == []
     assert narrow.client.get("/readyz").json() | {"version": ""} == {
         "status": "ready", "version": "", "read_only": False, "frames": {}, "jobs": {},
     }  # fmt: skip
@@ -166,13 +166,13 @@ def test_a_caller_who_hangs_up_leaves_nothing_behind(narrow, wire, small_shots):
 
 
 @pytest.mark.parametrize(
-    ("given", "kept_as_given"),
+    ("text", "kept_as_given"),
     [("abc-1.2_Z", True), ("a" * 64, True), ("a" * 65, False), ("a b", False), ("", False)],
 )
-def test_a_request_keeps_the_id_it_came_with_where_it_is_one(narrow, until, given, kept_as_given):
-    reply = narrow.client.get("/v1/maps/nowhere", headers={"X-Request-Id": given})
+def test_a_request_keeps_the_id_it_came_with_where_it_is_one(narrow, until, text, kept_as_given):
+    reply = narrow.client.get("/v1/maps/nowhere", headers={"X-Request-Id": text})
     own = reply.headers["x-request-id"]
-    assert (own == given) is kept_as_given
+    assert (own == text) is kept_as_given
     assert reply.json()["instance"] == f"/requests/{own}"
     assert reply.headers["x-content-type-options"] == "nosniff"
     # written once the answer has been sent

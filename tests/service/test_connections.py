@@ -231,13 +231,13 @@ def test_tls_is_of_version_1_2_or_later(opened, certificate):
 
 def test_a_certificate_that_cannot_be_used_is_said(certificate, tmp_path):
     cert, key = certificate
-    for given, said in (
+    for options, said in (
         ({"tls_cert": cert, "tls_key": tmp_path / "none.pem"}, "No such file or directory"),
         ({"tls_cert": key, "tls_key": key}, "cannot be used"),
         ({"tls_cert": cert, "tls_key": cert}, "cannot be used"),
     ):
         with pytest.raises(InvalidRequest, match=said):
-            connections.tls_context(Settings(**given))
+            connections.tls_context(Settings(**options))
     for half in ({"tls_cert": cert}, {"tls_key": key}):
         with pytest.raises(ValueError, match="HTTPS requires both SCENEPRINT_TLS_CERT"):
             Settings(**half)

@@ -20,32 +20,32 @@ def test_every_file_is_served_packed_guarded_and_not_sent_twice(served):
         on_disk = (dashboard.PAGES / name).read_bytes()
         with served.client.stream(
             "GET", f"/dashboard/{name}", headers={"Accept-Encoding": "gzip"}
-        ) as got:
-            packed = b"".join(got.iter_raw())
-        assert got.status_code == 200, name
+        ) as response:
+            packed = b"".join(response.iter_raw())
+        assert response.status_code == 200, name
         assert gzip.decompress(packed) == on_disk
-        assert got.headers["content-encoding"] == "gzip"
-        assert got.headers["content-length"] == str(len(packed))
-        assert got.headers["content-security-policy"] == POLICY
-        assert got.headers["cache-control"] == "no-cache"
-        assert got.headers["x-content-type-options"] == "nosniff"
+        assert response.headers["content-encoding"] == "gzip"
+        assert response.headers["content-length"] == str(len(packed))
+        assert response.headers["content-security-policy"] == POLICY
+        assert response.headers["cache-control"] == "no-cache"
+        assert response.headers["x-content-type-options"] == "nosniff"
         if name != "main.js":
             continue
-        known = {"If-None-Match": got.headers["etag"], "Accept-Encoding": "gzip"}
-        again = served.client.get(f"/dashboard/{name}", headers=known)
+        fields = {"If-None-Match": response.headers["etag"], "Accept-Encoding": "gzip"}
+        again = served.client.get(f"/dashboard/{name}", headers=fields)
         assert (again.status_code, again.content) == (304, b"")
         assert again.headers["content-security-policy"] == POLICY
         plain = served.client.get(f"/dashboard/{name}", headers={"Accept-Encoding": "identity"})
         assert plain.content == on_disk
         assert "content-encoding" not in plain.headers
-        assert plain.headers["etag"] != got.headers["etag"]  # other bytes, another tag
+        assert plain.headers["etag"] != response.headers["etag"]  # other bytes, another tag
 
 
 def test_the_page_is_at_the_address_without_a_slash(served):
     index = (dashboard.PAGES / "index.html").read_bytes()
-    got = served.client.get("/dashboard")
-    assert got.content == index
-    assert got.headers["content-type"] == "text/html; charset=utf-8"
+    response = served.client.get("/dashboard")
+    assert response.content == index
+    assert response.headers["content-type"] == "text/html; charset=utf-8"
     head = served.client.head("/dashboard")
     assert (head.status_code, head.content) == (200, b"")
     slash = served.client.get("/dashboard/")
@@ -70,11 +70,11 @@ def test_a_browser_is_led_there_and_others_are_told_as_ever(served):
     ],
 )  # fmt: skip
 def test_no_other_path_leads_to_a_file(served, path):
-    got = served.client.get(path, headers=HTML)
-    assert got.status_code == 404
-    assert got.headers["content-type"] == "application/problem+json"
-    assert got.json()["type"] == "/problems/not-found"
-    assert "default-src 'none'" in got.headers["content-security-policy"]
+    response = served.client.get(path, headers=HTML)
+    assert response.status_code == 404
+    assert response.headers["content-type"] == "application/problem+json"
+    assert response.json()["type"] == "/problems/not-found"
+    assert "default-src 'none'" in response.headers["content-security-policy"]
 
 
 def test_it_is_for_whom_the_service_is_for(served, refused):

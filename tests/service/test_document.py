@@ -32,16 +32,16 @@ def operations(document):
 def test_the_document_is_whole(document):
     assert document["openapi"].startswith("3.1.")
     assert document["info"]["title"] == "sceneprint"
-    found = set(references(document))
-    assert len(found) >= 20
-    for reference in found:
+    result = set(references(document))
+    assert len(result) >= 20
+    for reference in result:
         place = document
         for step in reference.removeprefix("#/").split("/"):
             place = place[step]
         assert isinstance(place, dict)
     names = [operation["operationId"] for operation in operations(document).values()]
     assert len(names) == len(set(names))  # how many there are, its golden tells
-    used = {reference.rpartition("/")[2] for reference in found}
+    used = {reference.rpartition("/")[2] for reference in result}
     assert set(document["components"]["schemas"]) == used  # nothing that nothing refers to
 
 
@@ -72,8 +72,8 @@ def test_who_has_the_document_is_not_sent_it_again(served):
     sent = get(**{"Accept-Encoding": "identity"})
     tag = sent.headers["etag"]
     assert hashlib.sha256(sent.content).hexdigest().startswith(tag.strip('"'))
-    known = get(**{"Accept-Encoding": "identity", "If-None-Match": tag})
-    assert (known.status_code, known.content, known.headers["etag"]) == (304, b"", tag)
+    response = get(**{"Accept-Encoding": "identity", "If-None-Match": tag})
+    assert (response.status_code, response.content, response.headers["etag"]) == (304, b"", tag)
     packed = get(**{"Accept-Encoding": "gzip"})
     assert (packed.headers["content-encoding"], packed.content) == ("gzip", sent.content)
     assert packed.headers["etag"] != tag

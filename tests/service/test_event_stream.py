@@ -35,12 +35,12 @@ def ids(batch):
 
 async def gather(batches, count):
     """The numbers of so many events, as they come."""
-    found = []
-    while len(found) < count:
+    results = []
+    while len(results) < count:
         batch = await asyncio.wait_for(anext(batches), PATIENCE_S)
         assert not batch[0] or batch[1] >= batch[0][-1].number
-        found += ids(batch)
-    return found
+        results += ids(batch)
+    return results
 
 
 def always():

@@ -51,9 +51,9 @@ def parts(response):
 def event(lines):
     number, data = lines
     assert data.startswith("data: ")
-    found = json.loads(data.removeprefix("data: "))
-    assert number == f"id: {found['id']}"
-    return found
+    body = json.loads(data.removeprefix("data: "))
+    assert number == f"id: {body['id']}"
+    return body
 
 
 def next_event(messages):
@@ -76,13 +76,13 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
         first = next_event(came)
         assert (first["kind"], first["map"], first["frame_id"]) == ("map.created", "told", None)
         sent = client.post(f"{path}/frames", **small_shots[0].form()).json()
-        found = [next_event(came) for _ in range(2)]
-    assert [(one["kind"], one["frame_id"], one["job_id"]) for one in found] == [
+        result = [next_event(came) for _ in range(2)]
+    assert [(one["kind"], one["frame_id"], one["job_id"]) for one in result] == [
         ("frame.received", sent["frame_id"], sent["job_id"]),
         ("frame.indexed", sent["frame_id"], sent["job_id"]),
     ]
     client.delete(f"{path}/frames/{sent['frame_id']}")  # while nobody listens
-    again = STREAM | {"Last-Event-ID": found[0]["id"]}
+    again = STREAM | {"Last-Event-ID": result[0]["id"]}
     with client.stream("GET", "/v1/events?map=told&after=0", headers=again) as stream:
         came = parts(stream)
         assert next(came) == ["retry: 1000"]
@@ -91,7 +91,7 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
     filters = {"map": "told", "kind": ["map.", "frame.i"], "order": "oldest"}
     page = client.get("/v1/events", params=filters).json()
     assert [item["kind"] for item in page["items"]] == ["map.created", "frame.indexed"]
-    assert page["items"] == [first, found[1]]
+    assert page["items"] == [first, result[1]]
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_a_map_that_is_not_there_has_no_events(served, refused):
 
 
 def test_a_key_is_told_of_its_maps_alone(guarded, keys, refused):
-    def kinds(who, **filters):
-        answer = guarded.client.get("/v1/events", params=filters, headers=keys[who])
+    def kinds(key, **filters):
+        answer = guarded.client.get("/v1/events", params=filters, headers=keys[key])
         return {(item["kind"], item["map"]) for item in answer.json()["items"]}
 
     assert kinds("admin") >= {

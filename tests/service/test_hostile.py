@@ -58,8 +58,8 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
         assert answer.headers["retry-after"] == "1"
     assert tree(server.folder / "blobs") == blobs  # no blob without a row, no part
     assert server.client.get("/readyz").json() == before
-    found = server.client.post(f"{path}/queries", json={"frame_id": first})
-    assert found.status_code == 200
+    response = server.client.post(f"{path}/queries", json={"frame_id": first})
+    assert response.status_code == 200
     query = server.client.post(f"{path}/queries", **shots[0].form())
     assert (query.status_code, query.json()["status"]) == (200, "found")
     os.kill(worker, signal.SIGCONT)
@@ -81,7 +81,7 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
 
 
 @pytest.fixture(scope="module")
-def kept(begin, make_map, small_shots):
+def busy(begin, make_map, small_shots):
     """A service with three indexed frames, that works on one thing at a time and lets few wait."""
     server = begin(concurrent_requests=1, queued_requests=2)
     path = make_map(server, "hall")
@@ -91,36 +91,36 @@ def kept(begin, make_map, small_shots):
 
 
 @pytest.mark.thorough
-def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shots, refused, until):
+def test_another_process_that_keeps_writing_stops_uploads_alone(busy, small_shots, refused, until):
     path = "/v1/maps/hall"
 
     def upload(i):
-        return kept.client.post(f"{path}/frames", **small_shots[i].form())
+        return busy.client.post(f"{path}/frames", **small_shots[i].form())
 
     with (
-        Engine(Settings(data_dir=kept.folder, database_url=None)) as other,
+        Engine(Settings(data_dir=busy.folder, database_url=None)) as other,
         other.store.database.write() as writing,
     ):
         allow(writing, 0)
         with ThreadPoolExecutor(4) as pool:
             sent = [pool.submit(upload, i) for i in (8, 9, 10, 11)]
             until(lambda: any(one.done() for one in sent))
-            query = kept.client.post(f"{path}/queries", **small_shots[0].form())
+            query = busy.client.post(f"{path}/queries", **small_shots[0].form())
             assert (query.status_code, query.json()["status"]) == (200, "found")
             for address in ("/healthz", "/readyz", "/metrics", path, f"{path}/frames"):
-                assert kept.client.get(address).status_code == 200
+                assert busy.client.get(address).status_code == 200
             answers = [one.result() for one in sent]
             for answer in answers:
                 assert (answer.status_code, answer.headers["retry-after"]) == (503, "1")
             kinds = [answer.json()["type"].rpartition("/")[2] for answer in answers]
             assert kinds == ["store-locked"] * 4
         refused(upload(11), 503, "store-locked", "nothing was stored")
-        deleted = kept.client.delete(f"{path}/frames/none")
+        deleted = busy.client.delete(f"{path}/frames/none")
         refused(deleted, 503, "store-locked")
-    assert kept.client.get("/readyz").json()["frames"] == {"indexed": 3}
+    assert busy.client.get("/readyz").json()["frames"] == {"indexed": 3}
     assert [upload(i).status_code for i in (8, 9, 10)] == [202, 202, 202]
-    until(lambda: kept.client.get("/readyz").json()["frames"] == {"indexed": 6})
-    assert kept.log("worker died") == []
+    until(lambda: busy.client.get("/readyz").json()["frames"] == {"indexed": 6})
+    assert busy.log("worker died") == []
 
 
 #: Permissions hold for root as well: PR_CAPBSET_DROP, CAP_DAC_OVERRIDE.

@@ -15,8 +15,8 @@ PATHS = ["/healthz", "/readyz", "/metrics", "/openapi.json", "/docs", "/v1/maps"
 @pytest.mark.parametrize("host", HERE)
 def test_by_its_own_names_it_answers_on_any_port(served, host, port):
     assert served.client.get("/v1/maps", headers={"Host": host + port}).status_code == 200
-    given = {"Host": host + port, "Origin": f"http://{host}{port}"}
-    assert served.client.get("/v1/maps", headers=given).status_code == 200
+    headers = {"Host": host + port, "Origin": f"http://{host}{port}"}
+    assert served.client.get("/v1/maps", headers=headers).status_code == 200
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -30,11 +30,11 @@ def test_by_another_name_nothing_is_told(served, refused, path):
 
 @pytest.mark.parametrize("host", ELSEWHERE)
 def test_what_only_looks_like_a_name_of_ours_is_none(served, refused, host):
-    given = {"Host": host.encode("latin-1")}
-    refused(served.client.get("/v1/maps", headers=given), 421, "misdirected")
+    headers = {"Host": host.encode("latin-1")}
+    refused(served.client.get("/v1/maps", headers=headers), 421, "misdirected")
     for origin in (f"http://{host}", host):
-        given = {"Origin": origin.encode("latin-1")}
-        refused(served.client.get("/v1/maps", headers=given), 403, "foreign-origin")
+        headers = {"Origin": origin.encode("latin-1")}
+        refused(served.client.get("/v1/maps", headers=headers), 403, "foreign-origin")
 
 
 @pytest.mark.parametrize("origin", ["null", "file://", "//localhost/x"])
@@ -43,8 +43,8 @@ def test_a_page_without_a_host_is_a_strangers(served, refused, origin):
 
 
 def test_a_page_makes_nothing_and_its_body_is_not_waited_for(served, refused):
-    given = {"Origin": "http://evil.example", "Content-Type": "application/json"}
-    answer = served.client.post("/v1/maps", content=b'{"name": "stolen"}', headers=given)
+    headers = {"Origin": "http://evil.example", "Content-Type": "application/json"}
+    answer = served.client.post("/v1/maps", content=b'{"name": "stolen"}', headers=headers)
     refused(answer, 403, "foreign-origin")
     refused(served.client.get("/v1/maps/stolen"), 404, "unknown-map")
     head = b"POST /v1/maps HTTP/1.1\r\nHost: evil.example\r\nContent-Length: 99\r\n\r\n"
@@ -62,8 +62,8 @@ def test_a_page_makes_nothing_and_its_body_is_not_waited_for(served, refused):
     ],
 )
 def test_a_page_of_others_that_sends_no_origin_is_told_nothing(served, refused, path, site, kind):
-    given = {"Sec-Fetch-Site": site, "Sec-Fetch-Dest": kind, "Sec-Fetch-Mode": "no-cors"}
-    answer = served.client.get(path, headers=given)
+    headers = {"Sec-Fetch-Site": site, "Sec-Fetch-Dest": kind, "Sec-Fetch-Mode": "no-cors"}
+    answer = served.client.get(path, headers=headers)
     refused(answer, 403, "foreign-origin", "A page of another origin loaded this address")
 
 
@@ -82,20 +82,20 @@ def test_our_own_pages_and_typed_addresses_are_answered(served, site):
     ],
 )  # fmt: skip
 def test_a_link_of_others_leads_to_pages_and_to_nothing_else(served, path, status):
-    given = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Accept": "text/html"}
-    followed = served.client.get(path, headers=given | {"Sec-Fetch-Dest": "document"})
+    headers = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Accept": "text/html"}
+    followed = served.client.get(path, headers=headers | {"Sec-Fetch-Dest": "document"})
     assert followed.status_code == status
-    framed = served.client.get(path, headers=given | {"Sec-Fetch-Dest": "iframe"})
+    framed = served.client.get(path, headers=headers | {"Sec-Fetch-Dest": "iframe"})
     assert framed.status_code == 403
 
 
 def test_a_page_of_this_machine_that_says_who_it_is_may_ask(served):
-    given = {"Origin": "http://localhost:3000", "Sec-Fetch-Site": "same-site"}
-    assert served.client.get("/v1/maps", headers=given).status_code == 200
+    headers = {"Origin": "http://localhost:3000", "Sec-Fetch-Site": "same-site"}
+    assert served.client.get("/v1/maps", headers=headers).status_code == 200
 
 
 def test_where_keys_are_asked_for_any_name_will_do(walled, refused):
     wide = walled.server
-    for given in ({"Host": "map.example"}, {"Origin": "https://map.example"}):
-        assert wide.client.get("/healthz", headers=given).status_code == 200
-        refused(wide.client.get("/v1/maps", headers=given), 401, "key-required")
+    for headers in ({"Host": "map.example"}, {"Origin": "https://map.example"}):
+        assert wide.client.get("/healthz", headers=headers).status_code == 200
+        refused(wide.client.get("/v1/maps", headers=headers), 401, "key-required")

@@ -150,7 +150,7 @@ class There:
 @pytest.fixture(scope="module")
 def there(walled, small_shots, until):
     """Two maps with three frames each, and of each an answer and a job of every kind."""
-    found = {}
+    results = {}
     for name, some in ((OWN, small_shots[:3]), (THEIRS, small_shots[1:4])):
         created = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
         assert created.status_code == 201
@@ -191,12 +191,12 @@ def there(walled, small_shots, until):
         alone = sent[0 if name == OWN else 2]["frame_id"]  # the other map has not its content
         names, *rows = copied(walled, "boss", name)
         row = next(row for row in rows if row[0] == alone)
-        found[name] = There(
+        results[name] = There(
             name, frame, query, sent[0]["job_id"], *jobs, tiles[0]["digest"], session,
             row[names.index("geometry")],
         )  # fmt: skip
-    found[NONE] = There(NONE, *[NO_ID] * 8, f"run-of-{NONE}", "0" * 64)
-    return found
+    results[NONE] = There(NONE, *[NO_ID] * 8, f"run-of-{NONE}", "0" * 64)
+    return results
 
 
 def copied(walled, key, name):
@@ -220,8 +220,8 @@ def operations(walled):
 def request_of(operation, case, path, rest):
     """Arguments of a request: the map of the path is of one, all other ids of another."""
 
-    def part(found):
-        return (path if found[1] == "map_name" else rest).of(operation, found[1])
+    def part(match):
+        return (path if match[1] == "map_name" else rest).of(operation, match[1])
 
     method, pattern = operation.split()
     request = {"method": method, "path": re.sub(r"\{(\w+)\}", part, pattern)}
@@ -270,8 +270,8 @@ def test_what_is_anothers_is_answered_as_what_is_not_there(walled, there, operat
             continue
         answers = []
         for of_path, rest in zip(path, (THEIRS, NONE), strict=True):
-            given = request_of(operation, case, there[of_path], there[rest])
-            answers.append((walled.ask(key, **given), there[rest]))
+            request = request_of(operation, case, there[of_path], there[rest])
+            answers.append((walled.ask(key, **request), there[rest]))
         (theirs, about), (none, nothing) = answers
         assert answers_of(theirs, about) == answers_of(none, nothing), operation
         requests += 1
@@ -365,8 +365,8 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
     assert [one.json()["detail"].replace(mixed, "0" * 32) for one in again] \
         == [again[1].json()["detail"]] * 2  # fmt: skip
     assert [one.status_code for one in again] == [404, 404]
-    kept = walled.ask("boss", "PUT", f"/v1/queries/{mixed}/keep", json={"title": "secret"})
-    assert kept.status_code == 200
+    record = walled.ask("boss", "PUT", f"/v1/queries/{mixed}/keep", json={"title": "secret"})
+    assert record.status_code == 200
     for method in ("PUT", "DELETE"):
         unseen(walled, method, "/v1/queries/{}/keep", mixed)
     for path in ("/v1/queries?kept=true", f"/v1/queries?kept=true&map={OWN}"):
@@ -411,8 +411,8 @@ def test_what_is_anothers_beside_what_is_the_keys_own(walled, there):
         answers = []
         for one in (there[THEIRS], there[NONE]):
             content = one.fill(json.dumps(body))
-            given = {"content": content, "headers": {"Content-Type": "application/json"}}
-            answers.append(answers_of(walled.ask("admin", "POST", path, **given), one))
+            request = {"content": content, "headers": {"Content-Type": "application/json"}}
+            answers.append(answers_of(walled.ask("admin", "POST", path, **request), one))
         if answers[0][0] == 200:  # an answer of its own map, with what becomes of the other frame
             texts = [json.loads(text) for _, _, text in answers]
             assert texts[0]["explanation"] == texts[1]["explanation"]
@@ -423,8 +423,8 @@ def test_what_is_anothers_beside_what_is_the_keys_own(walled, there):
 @pytest.mark.parametrize("operation", OF_ALL)
 def test_what_is_the_operators_is_nobody_elses(walled, there, refused, operation):
     for key in ("admin", "reader"):
-        given = request_of(operation, Case(), there[THEIRS], there[THEIRS])
-        refused(walled.ask(key, **given), 403, "forbidden", "for all maps")
+        request = request_of(operation, Case(), there[THEIRS], there[THEIRS])
+        refused(walled.ask(key, **request), 403, "forbidden", "for all maps")
 
 
 def test_a_key_may_not_more_than_its_scope(walled, there, refused):
@@ -432,10 +432,10 @@ def test_a_key_may_not_more_than_its_scope(walled, there, refused):
     own = there[OWN]
     for operation, case in OF_A_MAP.items():
         for key in less.get(case.scope, []):
-            given = request_of(operation, case, own, own)
+            request = request_of(operation, case, own, own)
             if operation == "POST /v1/maps":
-                given["content"] = json.dumps({"name": OWN})
-            answer = walled.ask(key, **given)
+                request["content"] = json.dumps({"name": OWN})
+            answer = walled.ask(key, **request)
             if "imports" in operation and answer.status_code == 404:
                 continue
             refused(answer, 403, "forbidden", f"{case.scope!r}")
@@ -447,8 +447,8 @@ def test_without_a_key_no_body_is_waited_for(walled, there, operations):
     with ExitStack() as opened:
         wires = {}
         for operation in operations.keys() - set(OF_NOBODY):
-            given = request_of(operation, Case(), there[OWN], there[OWN])
-            head = f"{given['method']} {given['path']} HTTP/1.1\r\nHost: localhost\r\n"
+            request = request_of(operation, Case(), there[OWN], there[OWN])
+            head = f"{request['method']} {request['path']} HTTP/1.1\r\nHost: localhost\r\n"
             if "requestBody" in operations[operation]:
                 head += "Content-Type: application/json\r\nContent-Length: 99\r\n"
             wires[operation] = opened.enter_context(walled.server.connect())

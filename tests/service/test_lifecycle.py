@@ -74,8 +74,8 @@ def test_a_worker_that_dies_is_replaced_and_its_frame_signed(
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(begin, tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
         server = begin("--port", str(port), folder=tmp_path / "new", wait=False)
         assert server.end() == 2
     assert not (tmp_path / "new").exists()
@@ -90,12 +90,12 @@ def test_a_port_that_is_taken_is_refused_in_one_line(begin, tmp_path):
 
 @pytest.mark.thorough
 def test_service_and_worker_alone_do_the_job_together(begin, make_map, small_shots, tmp_path):
-    given = {"data_dir": tmp_path, "port": 0, "workers": 1}
-    service = begin(command=(sys.executable, "-m", "service"), **given)
+    settings = {"data_dir": tmp_path, "port": 0, "workers": 1}
+    service = begin(command=(sys.executable, "-m", "service"), **settings)
     path = make_map(service, "hall")
     sent = service.client.post(f"{path}/frames", **small_shots[0].form())
     assert (sent.status_code, service.workers) == (202, [])
-    worker = begin(command=(sys.executable, "-m", "worker"), wait=False, **given)
+    worker = begin(command=(sys.executable, "-m", "worker"), wait=False, **settings)
     waited = service.client.post(
         f"{path}/frames", **small_shots[1].form(), headers={"Prefer": "wait=200"}
     )

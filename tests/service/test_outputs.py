@@ -105,14 +105,14 @@ def test_an_edit_does_not_overwrite_another(served, shown, refused):
     assert (done.json()["tags"], done.json()["robot"]) == (["window"], None)
     assert done.headers["etag"] == served.client.get(url).headers["etag"] != tag
     assert done.json() == served.client.get(url).json()
-    for given in (tag, f"W/{done.headers['etag']}", '"a", "b"'):
-        late = served.client.patch(url, json={"tags": []}, headers={"If-Match": given})
+    for options in (tag, f"W/{done.headers['etag']}", '"a", "b"'):
+        late = served.client.patch(url, json={"tags": []}, headers={"If-Match": options})
         refused(late, 412, "precondition-failed")
     refused(
         served.client.patch(url, json={}, headers={"If-Match": "5"}),
         422, "invalid-request", "including its quotes",
     )  # fmt: skip
-    for given in ({}, {"If-Match": "*"}, {"If-Match": f'"x", {done.headers["etag"]}'}):
-        assert served.client.patch(url, json={"robot": None}, headers=given).status_code == 200
+    for options in ({}, {"If-Match": "*"}, {"If-Match": f'"x", {done.headers["etag"]}'}):
+        assert served.client.patch(url, json={"robot": None}, headers=options).status_code == 200
     back = {"tags": ["door"], "robot": "r2"}
     assert served.client.patch(url, json=back).headers["etag"] == tag

@@ -58,9 +58,9 @@ class Asked:
 
     async def problem(self):
         """What it is refused with."""
-        found = await self.answer()
-        assert found["status"] == self.status
-        return found
+        result = await self.answer()
+        assert result["status"] == self.status
+        return result
 
 
 @pytest.fixture

@@ -147,7 +147,7 @@ def test_what_is_not_there_is_said_so(served, hall, refused, method, path, statu
 
 
 @pytest.mark.parametrize(
-    ("given", "field", "text"),
+    ("value", "field", "text"),
     [
         ('{"robot"', "filter", "not JSON"),
         ('{"robot": []}', "filter.robot", "at least 1"),
@@ -167,10 +167,10 @@ def test_what_is_not_there_is_said_so(served, hall, refused, method, path, statu
     ],
 )  # fmt: skip
 def test_a_filter_that_makes_no_sense_is_named(
-    served, hall, small_shots, refused, given, field, text
+    served, hall, small_shots, refused, value, field, text
 ):
     form = small_shots[0].form()
-    form["data"] |= {"stages": "retrieve", "k": "50", "filter": given}
+    form["data"] |= {"stages": "retrieve", "k": "50", "filter": value}
     answer = served.client.post(f"{hall}/queries", **form)
     problem = refused(answer, 422, "invalid-request")
     assert [error["field"] for error in problem["errors"]] == [field]

@@ -126,10 +126,10 @@ def test_all_pages_are_not_let_in_where_no_key_is_asked_for(tmp_path):
         assert (b"access-control-allow-origin", b"https://a.b") in wide.headers(b"https://a.b")
 
 
-@pytest.mark.parametrize("given", ["fleet.example", "https://fleet.example/", "ftp://a", "a b"])
-def test_an_origin_is_written_as_browsers_write_it(given):
+@pytest.mark.parametrize("text", ["fleet.example", "https://fleet.example/", "ftp://a", "a b"])
+def test_an_origin_is_written_as_browsers_write_it(text):
     with pytest.raises(ValueError, match="is not an origin"):
-        Settings(cors_origins=given)
+        Settings(cors_origins=text)
 
 
 # proxies
@@ -138,22 +138,22 @@ def test_an_origin_is_written_as_browsers_write_it(given):
 @pytest.mark.parametrize("header", ["X-Forwarded-For", "Forwarded", "X-Real-IP", "Via",
                                     "X-Forwarded-Proto"])  # fmt: skip
 def test_what_comes_through_a_proxy_needs_a_key(served, refused, header):
-    given = {header: "127.0.0.1"}
+    headers = {header: "127.0.0.1"}
     for path in ("/v1/maps", "/v1/jobs", "/metrics"):
-        answer = served.client.get(path, headers=given)
+        answer = served.client.get(path, headers=headers)
         refused(answer, 401, "key-required", f"it has the header {header.title()}")
-    ready = served.client.get("/readyz", headers=given)
+    ready = served.client.get("/readyz", headers=headers)
     assert (ready.status_code, ready.json()["frames"]) == (200, None)
 
 
 def test_with_its_key_a_caller_behind_a_proxy_has_what_the_key_may(served, refused):
     client = served.client
     key = client.post("/v1/keys", json={"name": "far", "grants": {"hall": "read"}})
-    given = {"X-Forwarded-For": "1.2.3.4", "Authorization": f"Bearer {key.json()['secret']}"}
-    assert client.get("/v1/maps", headers=given).status_code == 200
-    me = client.get("/v1/keys/me", headers=given).json()
+    headers = {"X-Forwarded-For": "1.2.3.4", "Authorization": f"Bearer {key.json()['secret']}"}
+    assert client.get("/v1/maps", headers=headers).status_code == 200
+    me = client.get("/v1/keys/me", headers=headers).json()
     assert (me["name"], me["grants"]) == ("far", {"hall": "read"})
-    refused(client.get("/v1/keys", headers=given), 403, "forbidden", "'admin' for all maps")
+    refused(client.get("/v1/keys", headers=headers), 403, "forbidden", "'admin' for all maps")
     assert client.get("/v1/keys/me").json()["name"] is None  # here, without the proxy
 
 

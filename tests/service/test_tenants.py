@@ -248,9 +248,9 @@ def test_metrics_tell_tenants_apart(shared, until):
             enqueue(connection, "purge", None)
 
     def series(name):
-        found = shared.ask("victim", "GET", "/metrics").text
+        result = shared.ask("victim", "GET", "/metrics").text
         pattern = rf"^sceneprint_tenant_{name}{{(.*)}} (.*)$"
-        return {one[0]: float(one[1]) for one in re.findall(pattern, found, re.MULTILINE)}
+        return {one[0]: float(one[1]) for one in re.findall(pattern, result, re.MULTILINE)}
 
     seen = series("requests_total")
     assert seen['status="404",tenant="noisy"'] >= 1

@@ -125,8 +125,8 @@ def plain(texts):
     """Number random values in their order, and leave out times."""
     numbers = {}
 
-    def number(found):
-        return f"<{numbers.setdefault(found[0], len(numbers))}>"
+    def number(match):
+        return f"<{numbers.setdefault(match[0], len(numbers))}>"
 
     return [TOOK.sub("<took>", TIMES.sub("<time>", CHANCE.sub(number, one))) for one in texts]
 

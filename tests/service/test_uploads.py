@@ -158,10 +158,10 @@ def test_a_batch_that_is_none_is_refused_whole(served, hall, small_shots, refuse
     assert not any(frame["bytes"] == len(shot.png) for frame in frames)
 
 
-@pytest.mark.parametrize("given", ["11", "1.0", "high", "", "٣"])
-def test_a_priority_is_a_small_whole_number(served, hall, small_shots, refused, given):
+@pytest.mark.parametrize("text", ["11", "1.0", "high", "", "٣"])
+def test_a_priority_is_a_small_whole_number(served, hall, small_shots, refused, text):
     form = small_shots[30].form()
-    form["data"] |= {"priority": given}
+    form["data"] |= {"priority": text}
     problem = refused(served.client.post(f"{hall}/frames", **form), 422, "invalid-request")
     assert [error["field"] for error in problem["errors"]] == ["priority"]
     query = served.client.post(f"{hall}/queries", **form)

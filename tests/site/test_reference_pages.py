@@ -55,8 +55,8 @@ def sections(text, level=2):
 
 
 def test_everything_that_the_client_offers_is_described(pages):
-    found = sections(pages["reference/client.md"].text)
-    assert list(found) == [name for name in sceneprint_client.__all__ if name[0] != "_"]
+    result = sections(pages["reference/client.md"].text)
+    assert list(result) == [name for name in sceneprint_client.__all__ if name[0] != "_"]
     methods = {name for name in dir(Client) if name[0] != "_" and callable(getattr(Client, name))}
-    assert set(sections(found["Client"], 3)) == methods
+    assert set(sections(result["Client"], 3)) == methods
     assert len(methods) > 90

@@ -38,5 +38,5 @@ def test_nothing_is_loaded_from_another_host(site):
     assert len(loaded) > len(pages) > 10
     assert {url for url in loaded if urlsplit(url).netloc} == set()
     styles = "".join(path.read_text() for path in site.rglob("*.css"))
-    found = re.findall(r"url\(([^)]*)\)|@import\s+([^;]+)", styles)
-    assert {one for pair in found for one in pair if "//" in one and "data:" not in one} == set()
+    matches = re.findall(r"url\(([^)]*)\)|@import\s+([^;]+)", styles)
+    assert {one for pair in matches for one in pair if "//" in one and "data:" not in one} == set()

@@ -118,8 +118,8 @@ def hall(store):
 def received(store, hall):
     """A function that inserts a frame with default fields."""
 
-    def add(content, row=hall, frame_id=None, within=None, **given):
-        values = frame_values(content, **given)
+    def add(content, row=hall, frame_id=None, within=None, **fields):
+        values = frame_values(content, **fields)
         if within is not None:
             return add_frame(within, row.number, values, frame_id)
         with store.database.write() as connection:

@@ -70,8 +70,8 @@ def test_a_line_names_what_was_changed(store):
         record_event(connection, "key.created", name="screen")
         record_event(connection, "frame.damaged", "hall", "f2")  # was found, and not changed
         record_change(connection, "job.cancelled", "hall", "j2", kind="sign")
-    found = [(one.action, one.map, one.target, one.data) for one in lines_of(store)]
-    assert found == [
+    result = [(one.action, one.map, one.target, one.data) for one in lines_of(store)]
+    assert result == [
         ("frame.edited", "hall", "f1", {"fields": ["tags"]}),
         ("key.created", None, "screen", {"name": "screen"}),
         ("job.cancelled", "hall", "j2", {"kind": "sign"}),

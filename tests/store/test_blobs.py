@@ -40,7 +40,7 @@ def blobs(tmp_path):
 
 
 @pytest.fixture(params=["folder", "s3"])
-def kept(request, tmp_path):
+def bucket(request, tmp_path):
     """A new place for blobs, of each kind there is."""
     if request.param == "folder":
         return Kept(
@@ -56,88 +56,88 @@ def kept(request, tmp_path):
     )
 
 
-def test_a_blob_lies_under_the_hash_of_its_content(kept):
-    assert kept.blobs.put(b"depth") == kept.blobs.put(b"depth") == DIGEST
-    assert kept.files() == [KEY]
-    assert kept.blobs.get(DIGEST) == b"depth"
-    assert (kept.blobs.size(DIGEST), kept.blobs.size("0" * 64)) == (5, None)
-    assert kept.blobs.place(DIGEST).endswith(f"/{KEY}")
-    empty = kept.blobs.put(b"")
+def test_a_blob_lies_under_the_hash_of_its_content(bucket):
+    assert bucket.blobs.put(b"depth") == bucket.blobs.put(b"depth") == DIGEST
+    assert bucket.files() == [KEY]
+    assert bucket.blobs.get(DIGEST) == b"depth"
+    assert (bucket.blobs.size(DIGEST), bucket.blobs.size("0" * 64)) == (5, None)
+    assert bucket.blobs.place(DIGEST).endswith(f"/{KEY}")
+    empty = bucket.blobs.put(b"")
     assert empty == hashlib.sha256(b"").hexdigest()
-    assert kept.blobs.get(empty) == b""
-    assert sorted(kept.blobs.digests()) == sorted([DIGEST, empty])
+    assert bucket.blobs.get(empty) == b""
+    assert sorted(bucket.blobs.digests()) == sorted([DIGEST, empty])
 
 
-def test_one_flipped_bit_is_noticed(kept, tmp_path):
-    kept.blobs.put(b"depth")
-    assert kept.blobs.condition(DIGEST) == "sound"
+def test_one_flipped_bit_is_noticed(bucket, tmp_path):
+    bucket.blobs.put(b"depth")
+    assert bucket.blobs.condition(DIGEST) == "sound"
     data = bytearray(b"depth")
     data[4] ^= 1
-    kept.write(KEY, bytes(data))
+    bucket.write(KEY, bytes(data))
     with pytest.raises(DamagedBlob, match=f"{DIGEST[:12]} is damaged"):
-        kept.blobs.get(DIGEST)
-    assert kept.blobs.condition(DIGEST) == "damaged"
-    assert kept.blobs.condition(DIGEST, quick=True) == "sound"
-    with kept.blobs.locks.removing() as allowed:
+        bucket.blobs.get(DIGEST)
+    assert bucket.blobs.condition(DIGEST) == "damaged"
+    assert bucket.blobs.condition(DIGEST, quick=True) == "sound"
+    with bucket.blobs.locks.removing() as allowed:
         assert allowed
-        place = kept.blobs.quarantine(DIGEST, tmp_path / "away")
+        place = bucket.blobs.quarantine(DIGEST, tmp_path / "away")
     assert place == tmp_path / "away" / f"blob-{DIGEST}"
     assert place.read_bytes() == bytes(data)
-    assert kept.blobs.condition(DIGEST) == kept.blobs.condition("x") == "missing"
-    with kept.blobs.locks.removing():
-        assert kept.blobs.quarantine(DIGEST, tmp_path / "away") is None
+    assert bucket.blobs.condition(DIGEST) == bucket.blobs.condition("x") == "missing"
+    with bucket.blobs.locks.removing():
+        assert bucket.blobs.quarantine(DIGEST, tmp_path / "away") is None
 
 
 @pytest.mark.parametrize("left", [b"", b"dEpth"])
-def test_putting_the_bytes_again_mends_a_damaged_blob(kept, left):
-    kept.blobs.put(b"depth")
-    kept.write(KEY, left)
-    assert kept.blobs.put(b"depth") == DIGEST
-    assert kept.blobs.get(DIGEST) == b"depth"
+def test_putting_the_bytes_again_mends_a_damaged_blob(bucket, left):
+    bucket.blobs.put(b"depth")
+    bucket.write(KEY, left)
+    assert bucket.blobs.put(b"depth") == DIGEST
+    assert bucket.blobs.get(DIGEST) == b"depth"
 
 
-def test_a_missing_blob_is_said(kept):
+def test_a_missing_blob_is_said(bucket):
     with pytest.raises(DamagedBlob, match=r"(does not exist|No such file).*upload it again"):
-        kept.blobs.get(DIGEST)
+        bucket.blobs.get(DIGEST)
     with pytest.raises(FileNotFoundError):
-        kept.blobs.open(DIGEST)
-    assert not kept.blobs.holds(DIGEST)
-    kept.blobs.put(b"depth")
-    assert kept.blobs.holds(DIGEST)
-    kept.blobs.remove(DIGEST)
-    assert not kept.blobs.holds(DIGEST)
-    kept.blobs.remove(DIGEST)  # of no consequence
-    assert list(kept.blobs.digests()) == []
+        bucket.blobs.open(DIGEST)
+    assert not bucket.blobs.holds(DIGEST)
+    bucket.blobs.put(b"depth")
+    assert bucket.blobs.holds(DIGEST)
+    bucket.blobs.remove(DIGEST)
+    assert not bucket.blobs.holds(DIGEST)
+    bucket.blobs.remove(DIGEST)  # of no consequence
+    assert list(bucket.blobs.digests()) == []
 
 
 @pytest.mark.parametrize(
-    "given",
+    "text",
     ["", "../../etc/passwd", DIGEST[:-1], DIGEST + "\n", DIGEST.upper(), "/" * 64, "\u0660" * 64],
 )
-def test_nothing_but_a_digest_becomes_a_path(blobs, given):
+def test_nothing_but_a_digest_becomes_a_path(blobs, text):
     others = ObjectBlobs(open_objects("memory:///"), FileLocks(Path("/none")), lambda: "me")
     for each in (blobs, others):
         for call in (each.get, each.open, each.holds, each.size, each.remove):
             with pytest.raises(ValueError, match="is not a digest"):
-                call(given)
-        assert each.condition(given) == "missing"
+                call(text)
+        assert each.condition(text) == "missing"
 
 
-def test_a_blob_in_parts_is_there_whole_or_not_at_all(kept):
+def test_a_blob_in_parts_is_there_whole_or_not_at_all(bucket):
     parts = [bytes([number]) * 3_000_000 for number in range(7)]  # more than a store takes at once
     whole = b"".join(parts)
-    with kept.blobs.incoming() as blob:
+    with bucket.blobs.incoming() as blob:
         blob.write(parts[0])
-    assert kept.files() == []
-    with kept.blobs.incoming() as blob:
+    assert bucket.files() == []
+    with bucket.blobs.incoming() as blob:
         for part in parts:
             blob.write(part)
         digest = blob.keep()
     assert digest == hashlib.sha256(whole).hexdigest()
-    assert kept.files() == [f"blobs/{digest[:2]}/{digest}"]
-    assert kept.blobs.get(digest) == whole
-    assert kept.blobs.condition(digest) == "sound"
-    with kept.blobs.open(digest) as file:
+    assert bucket.files() == [f"blobs/{digest[:2]}/{digest}"]
+    assert bucket.blobs.get(digest) == whole
+    assert bucket.blobs.condition(digest) == "sound"
+    with bucket.blobs.open(digest) as file:
         file.seek(2_999_990)
         assert file.read(20) == b"\0" * 10 + b"\1" * 10
         assert file.seek(-5, os.SEEK_END) == len(whole) - 5
@@ -145,9 +145,9 @@ def test_a_blob_in_parts_is_there_whole_or_not_at_all(kept):
         assert file.read(1) == b""
 
 
-def test_a_full_disk_leaves_no_part_of_a_blob(kept):
+def test_a_full_disk_leaves_no_part_of_a_blob(bucket):
     def fill():
-        with kept.blobs.incoming() as blob:
+        with bucket.blobs.incoming() as blob:
             for _ in range(20):
                 blob.write(b"x" * 5000)
 
@@ -158,24 +158,24 @@ def test_a_full_disk_leaves_no_part_of_a_blob(kept):
             fill()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert kept.files() == []
+    assert bucket.files() == []
 
 
-def test_what_others_leave_there_is_no_blob(kept):
-    kept.blobs.put(b"depth")
-    kept.write(f"blobs/{DIGEST[:2]}/.0123456789ab.part", b"half")
-    kept.write("blobs/readme", DIGEST.encode())
-    kept.write(f"blobs/{DIGEST[:2]}/{'0' * 64}", b"of another folder")
-    found = {Path(e.place).name: (e.digest, e.unfinished) for e in kept.blobs.entries()}
-    part = found.pop(".0123456789ab.part", None)
+def test_what_others_leave_there_is_no_blob(bucket):
+    bucket.blobs.put(b"depth")
+    bucket.write(f"blobs/{DIGEST[:2]}/.0123456789ab.part", b"half")
+    bucket.write("blobs/readme", DIGEST.encode())
+    bucket.write(f"blobs/{DIGEST[:2]}/{'0' * 64}", b"of another folder")
+    result = {Path(e.place).name: (e.digest, e.unfinished) for e in bucket.blobs.entries()}
+    part = result.pop(".0123456789ab.part", None)
     assert part in ((None, True), (None, False), None)  # an object store has no half objects
-    assert found == {
+    assert result == {
         DIGEST: (DIGEST, False), "readme": (None, False), "0" * 64: (None, False),
     }  # fmt: skip
 
 
-def test_who_needs_blobs_keeps_others_from_removing_them(kept):
-    locks = kept.blobs.locks
+def test_who_needs_blobs_keeps_others_from_removing_them(bucket):
+    locks = bucket.blobs.locks
     with locks.block_removals(), locks.block_removals(), locks.removing() as allowed:
         assert not allowed
     with locks.removing() as allowed, locks.removing() as also:

@@ -70,13 +70,13 @@ def mixed(store, hall, received):
         for row in rows[::3]:
             write_frame(connection, hall, row, drawn(rng))
     with store.database.read() as connection:
-        found = [
+        result = [
             frame
             for state in FrameState
             for frame in list_frames(connection, hall.number, None, 99, FrameListing(state=state))
         ]
-    assert len(found) == 60
-    return sorted(found, key=lambda row: row.number)
+    assert len(result) == 60
+    return sorted(result, key=lambda row: row.number)
 
 
 def passes(one, w):
@@ -117,9 +117,9 @@ def some_listing(rng):
         "find": str(rng.choice(["a", "s1", "s", "b\U0010ffff", *"0123456789abcdef"])),
     }  # fmt: skip
     names = rng.permutation(list(every))[: rng.integers(0, 4)]
-    given = {name: every[name] for name in names}
-    orders = ["asc", "desc", "taken", "taken"] if "session" in given else ["asc", "desc"]
-    return FrameListing.model_validate({**given, "order": rng.choice(orders)})
+    fields = {name: every[name] for name in names}
+    orders = ["asc", "desc", "taken", "taken"] if "session" in fields else ["asc", "desc"]
+    return FrameListing.model_validate({**fields, "order": rng.choice(orders)})
 
 
 def position(one):
@@ -137,14 +137,14 @@ def test_every_list_is_that_of_plain_python(store, hall, mixed):
                 expected.reverse()
             elif wanted.order == "taken":
                 expected.sort(key=taken)
-            found = []
+            results = []
             while True:  # pages follow each other without a gap or a double
-                last = position(found[-1]) if found else None
+                last = position(results[-1]) if results else None
                 page = list_frames(connection, hall.number, last, limit, wanted)
-                found += page
+                results += page
                 if len(page) < limit:
                     break
-            assert found == expected, wanted
+            assert results == expected, wanted
             sizes[len(expected) > 0] += 1
     assert min(sizes.values()) > 13  # neither all empty nor all full
 
@@ -157,9 +157,9 @@ def test_sessions_are_those_of_plain_python(store, hall, mixed):
     with store.database.read() as connection:
         runs = list_runs(connection, hall.number, None, 99)
         paged, after = [], None
-        while found := list_runs(connection, hall.number, after, 2):
-            paged += found
-            after = (found[-1].session or "", found[-1].robot or "")
+        while result := list_runs(connection, hall.number, after, 2):
+            paged += result
+            after = (result[-1].session or "", result[-1].robot or "")
     assert paged == runs
     assert [(run.session or "", run.robot or "") for run in runs] == sorted(expected)
     for run in runs:
@@ -200,10 +200,10 @@ def test_poses_of_a_run_are_those_of_plain_python(store, hall, mixed):
         assert captured
         with store.database.read() as connection:
             assert stamps_of_run(connection, hall.number, run) == "captured"
-            found = poses_of_run(connection, hall.number, run, "captured")
+            result = poses_of_run(connection, hall.number, run, "captured")
             placed, _ = poses_of_run(connection, hall.number, run, "sequence")
             counted = count_run(connection, hall.number, run)
-        assert found == (captured, len(captured))
+        assert result == (captured, len(captured))
         assert placed == stamped(own, run, lambda one: one.sequence)
         assert {(robot, parent): count for robot, parent, count in counted} == Counter(
             (one.robot, one.pose_parent) for one in own
@@ -246,10 +246,10 @@ def test_poses_are_taken_evenly(store, hall, received):
     ):  # fmt: skip
         with store.database.read() as connection:
             run = Run(session="s", parent_frame="p", most=most)
-            found, count = poses_of_run(connection, hall.number, run, "captured")
+            result, count = poses_of_run(connection, hall.number, run, "captured")
         assert count == 11
-        assert [at - START.timestamp() for _, at, _ in found] == list(places), most
-        assert found[0][0] == rows[0].id  # of two of one time, the first that came
+        assert [at - START.timestamp() for _, at, _ in result] == list(places), most
+        assert result[0][0] == rows[0].id  # of two of one time, the first that came
 
 
 SEARCHED = "USING COVERING INDEX ix_frames_searched"

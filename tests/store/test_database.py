@@ -85,12 +85,12 @@ def schema(path):
 def test_a_schema_that_finds_no_room_changes_nothing(tmp_path):
     path = tmp_path / "truth.db"
     url = f"sqlite:///{path}"
-    found = schema(path)
+    result = schema(path)
     done = subprocess.run(
         [sys.executable, "-c", OPENS, url], capture_output=True, text=True, check=True,
         preexec_fn=narrow,
     )  # fmt: skip
     assert "that the disk has free space" in done.stdout
-    assert schema(path) == found
+    assert schema(path) == result
     open_database(url).close()  # and with room it goes on
-    assert len(schema(path)) > len(found)
+    assert len(schema(path)) > len(result)

@@ -116,14 +116,14 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):
     def changes(since, *names):
         wanted = EventFilter(frozenset(names), since=since)
         with store.database.read() as connection:
-            found = [(event.kind, event.map) for event in list_events(connection, wanted)]
+            result = [(event.kind, event.map) for event in list_events(connection, wanted)]
             newest = newest_selected(connection, wanted)
             lost = removal_floor(connection, wanted, 1, 0)
             numbers = connection.execute(select(events.c.number, events.c.kind, events.c.map))
-            last = [row.number for row in numbers if (row.kind, row.map) in found]
+            last = [row.number for row in numbers if (row.kind, row.map) in result]
         assert newest == max(last, default=0)
-        assert found or lost == 0
-        return found
+        assert result or lost == 0
+        return result
 
     def at(seconds):
         """When what has happened since the last time was."""

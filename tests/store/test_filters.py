@@ -12,7 +12,7 @@ from sceneprint_client.api import Filter, FrameState
 NOBODY = QueryOrigin(None, None, None)
 
 
-def found(store, row, taken=NOBODY, **wanted):
+def passing(store, row, taken=NOBODY, **wanted):
     with store.database.read() as connection:
         return sorted(passing_frames(connection, row.number, Filter(**wanted), taken).tolist())
 
@@ -21,8 +21,8 @@ def found(store, row, taken=NOBODY, **wanted):
 def indexed(store, received):
     """Insert a frame as queries find it."""
 
-    def add(content, **given):
-        frame = received(content, **given)
+    def add(content, **fields):
+        frame = received(content, **fields)
         with store.database.write() as connection:
             connection.execute(
                 update(frames).where(frames.c.number == frame.number).values(state="indexed")
@@ -46,9 +46,9 @@ def test_only_indexed_frames_of_the_map_pass(store, hall, indexed, received):
         delete_frame(connection, hall, kept[0])
     numbers = [frame.number for frame in kept[1:]]
     for wanted in ({}, {"tags": ["a"]}, {"robot": "r1"}, {"exclude_frames": [kept[0].id]}):
-        assert found(store, hall, **wanted) == numbers  # two digits and more, too
-    assert found(store, attic) == [other.number]
-    assert found(store, hall, robot="r2") == []
+        assert passing(store, hall, **wanted) == numbers  # two digits and more, too
+    assert passing(store, attic) == [other.number]
+    assert passing(store, hall, robot="r2") == []
     with store.database.read() as connection:
         nobody = passing_frames(connection, 99, Filter(), NOBODY)
     assert (nobody.dtype, nobody.shape) == ("int64", (0,))
@@ -57,8 +57,8 @@ def test_only_indexed_frames_of_the_map_pass(store, hall, indexed, received):
 def test_own_session_is_that_of_the_robot(store, hall, indexed):
     """Named: by robot, session and time of a frame; the query is r1 in s at 100, 10 s away."""
     frames = {
-        given: indexed(str(given), robot=given[0], session=given[1], captured_at=given[2]).number
-        for given in [
+        text: indexed(str(text), robot=text[0], session=text[1], captured_at=text[2]).number
+        for text in [
             ("r1", "s", 89.9), ("r1", "s", 90.0), ("r1", "s", 110.0), ("r1", "s", 110.1),
             ("r1", "s", None), ("r1", "t", 100.0), ("r1", None, 100.0), ("r2", "s", 100.0),
             (None, "s", 100.0), (None, "s", 200.0), ("r2", "s", None),
@@ -68,12 +68,12 @@ def test_own_session_is_that_of_the_robot(store, hall, indexed):
             (None, "s", 200.0)]  # fmt: skip
     of_r2 = [("r2", "s", 100.0), ("r2", "s", None)]
     origin = QueryOrigin("r1", "s", 100.0)
-    assert found(store, hall, origin, not_within_s=10) == sorted(frames[o] for o in away + of_r2)
+    assert passing(store, hall, origin, not_within_s=10) == sorted(frames[o] for o in away + of_r2)
     # a query that names no robot may be any robot's
     origin = QueryOrigin(None, "s", 100.0)
-    assert found(store, hall, origin, not_within_s=10) == sorted(frames[o] for o in away)
+    assert passing(store, hall, origin, not_within_s=10) == sorted(frames[o] for o in away)
     with pytest.raises(ValueError, match="no session"):
-        found(store, hall, NOBODY, not_within_s=10)
+        passing(store, hall, NOBODY, not_within_s=10)
 
 
 BOX = {"min": {"x": 0, "y": 0, "z": 0}, "max": {"x": 1, "y": 1, "z": 1}}

@@ -139,8 +139,8 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(store, hall, received, in
         listings = (FrameListing(), FrameListing(state=FrameState.DELETED))
         assert (now.state, now.content_id, now.revision) == (FrameState.DELETED, None, 2)
         assert stored_maps.frames_of_content(connection, hall.number, "a") == []
-        found = [list_frames(connection, hall.number, None, 9, listing) for listing in listings]
-        assert found == [[other], [now]]
+        result = [list_frames(connection, hall.number, None, 9, listing) for listing in listings]
+        assert result == [[other], [now]]
         numbers = [frame.number, other.number]
         assert stored_maps.frames_of(connection, numbers) == {other.number: other}
         assert signed.stored_vector(connection, frame.number, hall.model_id) is None

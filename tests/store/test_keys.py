@@ -27,8 +27,8 @@ def test_a_secret_ends_with_its_overlap_and_the_next_goes_on(store, clock):
         assert ends == [1_000_100.0, 1_000_900.0]  # of the old secret, when it does
         clock[0] += 99
         third = keys.rotate_key(connection, "robot", 500)  # the first keeps its end
-        found = [keys.find_key(connection, one) for one in (first, second, third)]
-        assert [one and one.grants for one in found] == [{"hall": "write"}, None, {"hall": "write"}]
+        rows = [keys.find_key(connection, one) for one in (first, second, third)]
+        assert [one and one.grants for one in rows] == [{"hall": "write"}, None, {"hall": "write"}]
         clock[0] += 1
         assert keys.find_key(connection, first) is None
         fourth = keys.rotate_key(connection, "robot", 5000)  # a key ends with its own end
@@ -52,9 +52,9 @@ def test_a_use_is_written_once_an_hour(store, clock):
 
     def use():
         with store.database.read() as connection:
-            found = keys.find_key(connection, secret)
-        assert found is not None
-        uses.note(found)
+            key = keys.find_key(connection, secret)
+        assert key is not None
+        uses.note(key)
 
     use()
     assert used() == [None]  # nobody waits for it to be written
@@ -78,8 +78,8 @@ def test_a_key_is_shown_once_and_kept_as_a_hash(store):
         keys.create_key(connection, "fleet", {"*": "admin"})
     with store.database.read() as connection:
         assert [key.name for key in keys.list_keys(connection)] == ["dashboard", "fleet"]
-        found = [keys.find_key(connection, s) for s in (secret, other, secret[:-1], "")]
-        assert [one and (one.name, one.grants, one.expires_at) for one in found] == [
+        key_rows = [keys.find_key(connection, s) for s in (secret, other, secret[:-1], "")]
+        assert [one and (one.name, one.grants, one.expires_at) for one in key_rows] == [
             ("fleet", {"*": "admin"}, None), ("dashboard", {"hall": "read"}, 5.0), None, None,
         ]  # fmt: skip
         rows = connection.execute(select(table).order_by(table.c.name.desc())).all()

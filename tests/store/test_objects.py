@@ -13,14 +13,14 @@ from sceneprint.store.blobs.object_client import PART, check_objects, open_objec
 
 
 @pytest.mark.parametrize(
-    "given",
+    "text",
     ["s3://user:pw@bucket/x", "s3://bucket?access_key=pw", "s3://bucket/x#pw", "s3:///pw",
      "https://pw.example/x", "", "s3://[pw", "s3://bucket/../pw", "s3://bucket/%2e%2e/pw",
      "s3://bucket/a\0pw", "file:///", "file://host/pw", "memory://pw"],
 )  # fmt: skip
-def test_what_names_no_store_is_refused_and_not_repeated(given):
+def test_what_names_no_store_is_refused_and_not_repeated(text):
     with pytest.raises(UnusableStore, match="SCENEPRINT_BLOB_URL") as caught:
-        open_objects(given)
+        open_objects(text)
     assert "pw" not in str(caught.value)
 
 

@@ -203,8 +203,8 @@ def test_upkeep_waits_for_what_was_asked_and_what_no_key_asked_takes_turns(store
     queue_jobs(store, hall, "", 2, queue.UPKEEP)
     queue_jobs(store, hall, "", 1, queue.UPKEEP + 1)
     queue_jobs(store, hall, "a", 2, queue.UPKEEP)
-    taken = [hand.taken() for _ in range(5)]
-    assert [(job.tenant, job.priority) for job in taken] == [
+    claims = [hand.taken() for _ in range(5)]
+    assert [(job.tenant, job.priority) for job in claims] == [
         ("", -9), ("a", -10), ("a", -10), ("", -10), ("", -10),
     ]  # fmt: skip
 
@@ -213,9 +213,9 @@ def test_what_fell_silent_has_its_tenants_turn(store, hand, hall, turned):
     queue_jobs(store, hall, "a", 2)
     silent = hand.taken("dead", -1.0)
     queue_jobs(store, hall, "b", 1)
-    taken = [hand.taken() for _ in range(3)]
-    assert [job.tenant for job in taken] == ["b", "a", "a"]
-    assert silent.number == taken[2].number  # tried before: behind the tenant's other
+    claims = [hand.taken() for _ in range(3)]
+    assert [job.tenant for job in claims] == ["b", "a", "a"]
+    assert silent.number == claims[2].number  # tried before: behind the tenant's other
 
 
 def test_deleted_jobs_give_no_turn_back(store, hand, hall):
@@ -257,9 +257,9 @@ def test_jobs_and_leases_written_before_the_clock_was_set_back_are_taken(
 
 def test_processes_at_one_queue_get_each_job_once(url, store, hall, queued, race):
     wanted = [queued(str(i)).number for i in range(30)]
-    found = race(WORKS, 3, url, hall.number)
-    assert all(isinstance(each, list) for each in found), found  # else what was raised
-    assert sorted(number for each in found for number in each) == wanted
+    result = race(WORKS, 3, url, hall.number)
+    assert all(isinstance(each, list) for each in result), result  # else what was raised
+    assert sorted(number for each in result for number in each) == wanted
     with store.database.read() as connection:
         assert queue.count_jobs(connection) == {"succeeded": 30}
         assert find_map(connection, "hall").revision == 30

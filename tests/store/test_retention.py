@@ -34,25 +34,25 @@ def numbers_of(connection, name):
     return [event.number for event in list_events(connection, EventFilter()) if event.map == name]
 
 
-def expected(connection, kept, anchors):
+def expected(connection, count, anchors):
     """Of each map all but the newest, the one before these, and the anchors."""
     gone = set()
     for name, more in (("hall", 1), ("shop", 1), (None, 0)):
         numbers = numbers_of(connection, name)
-        gone |= set(numbers[: max(len(numbers) - kept - more, 0)]) - set(anchors)
+        gone |= set(numbers[: max(len(numbers) - count - more, 0)]) - set(anchors)
     return gone
 
 
-@pytest.mark.parametrize("kept", [1, 19, 20, 62])
-def test_what_is_not_kept_goes_and_the_anchors_stay(filled, kept):
+@pytest.mark.parametrize("count", [1, 19, 20, 62])
+def test_what_is_not_kept_goes_and_the_anchors_stay(filled, count):
     anchor = anchor_of_now(filled.database, "shop")
     with filled.database.write() as connection:
-        found = surplus_events(connection, kept, (6, 33), 99)
-        assert set(found) == expected(connection, kept, (6, 33))
-        assert len(found) == len(set(found))
-        assert surplus_events(connection, kept, (6, 33), 5) == found[:5]
-        remove_events(connection, found)
-        assert surplus_events(connection, kept, (6, 33), 99) == []
+        result = surplus_events(connection, count, (6, 33), 99)
+        assert set(result) == expected(connection, count, (6, 33))
+        assert len(result) == len(set(result))
+        assert surplus_events(connection, count, (6, 33), 5) == result[:5]
+        remove_events(connection, result)
+        assert surplus_events(connection, count, (6, 33), 99) == []
         assert holds_anchor(connection, anchor)
 
 

@@ -40,7 +40,7 @@ def test_an_old_process_writes_as_long_as_the_schema_allows_it(url, store):
     for turn in (True, False):
         with pytest.raises(NewerSchema, match=re.escape(said)):
             write("third", turn)
-    with closing(reach_database(url)) as found, found.read() as connection:
+    with closing(reach_database(url)) as result, result.read() as connection:
         names = connection.execute(text("SELECT map FROM events ORDER BY number")).scalars()
         assert list(names) == ["first", "second"]
 
@@ -55,7 +55,7 @@ def test_a_process_may_begin_on_a_later_schema_that_allows_it(url, store):
 def _range(url):
     """Return the revision of a store, and the oldest one whose processes may write to it."""
     query = text("SELECT version_num, least_revision FROM alembic_version, schema_range")
-    with closing(reach_database(url)) as found, found.read() as connection:
+    with closing(reach_database(url)) as result, result.read() as connection:
         revision, least = connection.execute(query).one()
         return revision, least
 

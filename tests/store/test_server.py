@@ -163,15 +163,15 @@ def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store):
         store_model(connection, "m", "n" * 200, b"x")
         add_map(connection, "hall", None, "m")
         assert [row.name for row in list_maps(connection)] == ["hall"]
-        found = connection.execute(select(maps.c.number).where(maps.c.name == "hall\0"))
-        assert found.all() == []
+        rows = connection.execute(select(maps.c.number).where(maps.c.name == "hall\0"))
+        assert rows.all() == []
 
 
 def test_more_numbers_are_asked_for_than_one_statement_takes(store, hall, received):
     numbers = [received(name).number for name in "abc"]
     with store.database.read() as connection:
-        found = frames_of(connection, range(70_000))
-    assert sorted(found) == numbers
+        result = frames_of(connection, range(70_000))
+    assert sorted(result) == numbers
 
 
 def test_what_was_stored_is_json(store, hall):
@@ -179,8 +179,8 @@ def test_what_was_stored_is_json(store, hall):
     data = {"b": 1, "a": ["\0", "\ud800", 1e300, None]}
     with store.database.write() as connection:
         record_event(connection, "map.edited", "hall", **data)
-        (found,) = connection.execute(select(events.c.data).where(events.c.kind == "map.edited"))
-    assert json.dumps(found[0]) == json.dumps(data)
+        (rows,) = connection.execute(select(events.c.data).where(events.c.kind == "map.edited"))
+    assert json.dumps(rows[0]) == json.dumps(data)
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_a_mistake_of_ours_stays_one(served):
 
 
 @pytest.mark.parametrize(
-    ("given", "kind", "said"),
+    ("value", "kind", "said"),
     [
         ("postgresql://u:hunter2@127.0.0.1:{port}/none", errors.UnusableStore, "does not exist"),
         ("postgres://none:hunter2@127.0.0.1:{port}/postgres", errors.UnusableStore, "user"),
@@ -240,7 +240,7 @@ def test_a_mistake_of_ours_stays_one(served):
     ],
 )  # fmt: skip
 def test_what_cannot_be_reached_is_said_without_the_password(
-    postgres, given, kind, said, monkeypatch
+    postgres, value, kind, said, monkeypatch
 ):
     monkeypatch.setenv("PGHOST", "/nowhere")
     port = postgres.url().rpartition(":")[2].partition("/")[0]
@@ -248,7 +248,7 @@ def test_what_cannot_be_reached_is_said_without_the_password(
         if use is database_exists and "Correct" not in said and "exist" not in said:
             continue  # it is asked before the database is opened, which says why
         with pytest.raises(errors.UnusableStore, match=said) as caught:
-            use(given.format(port=port))
+            use(value.format(port=port))
         assert "hunter2" not in str(caught.value)
         assert "er2" not in str(caught.value)
         assert isinstance(caught.value, kind)

@@ -49,11 +49,11 @@ def test_every_connection_of_the_pool_is_configured(store):
         held = [stack.enter_context(store.database.read()) for _ in range(12)]
         held.append(stack.enter_context(store.database.write()))
         for connection in held:
-            found = {
+            result = {
                 name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
                 for name in ("journal_mode", "synchronous", "foreign_keys", "busy_timeout")
             }
-            assert found == {
+            assert result == {
                 "journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 10_000,
             }  # fmt: skip
 

@@ -34,8 +34,8 @@ def together(database, works, *, one_by_one=False):
                 if one_by_one:
                     until_waiting(group, len(begun))
             until_waiting(group, len(works))
-        found = [one.exception() or one.result() for one in begun]
-    return found, commits[0] - 1
+        outcomes = [one.exception() or one.result() for one in begun]
+    return outcomes, commits[0] - 1
 
 
 def until_waiting(group, count):
@@ -60,8 +60,8 @@ def noting(kind, result):
 
 
 def test_who_waits_together_is_committed_together(database):
-    found, commits = together(database, [noting("a", i) for i in range(MOST_TOGETHER + 3)])
-    assert found == list(range(MOST_TOGETHER + 3))
+    outcomes, commits = together(database, [noting("a", i) for i in range(MOST_TOGETHER + 3)])
+    assert outcomes == list(range(MOST_TOGETHER + 3))
     assert count(database, "a") == MOST_TOGETHER + 3
     assert commits == 2  # at most MOST in one
 
@@ -84,8 +84,8 @@ def test_a_refusal_costs_no_other(database, kind):
     def refuse(_):
         raise kind("no")
 
-    found, commits = together(database, [noting("a", 0), refuse, noting("a", 2)])
-    assert (found[0], found[2], str(found[1])) == (0, 2, "no")
+    outcomes, commits = together(database, [noting("a", 0), refuse, noting("a", 2)])
+    assert (outcomes[0], outcomes[2], str(outcomes[1])) == (0, 2, "no")
     assert (count(database, "a"), commits) == (2, 1)
 
 
@@ -94,9 +94,9 @@ def test_what_breaks_a_transaction_leaves_no_trace_and_the_others_their_own(data
         record_event(connection, "broken", None, None)
         raise ValueError("a mistake")
 
-    found, _ = together(database, [noting("a", 0), break_down, noting("a", 2)])
-    assert (found[0], found[2]) == (0, 2)
-    assert isinstance(found[1], ValueError)
+    outcomes, _ = together(database, [noting("a", 0), break_down, noting("a", 2)])
+    assert (outcomes[0], outcomes[2]) == (0, 2)
+    assert isinstance(outcomes[1], ValueError)
     assert (count(database, "a"), count(database, "broken")) == (2, 0)
 
 
@@ -105,8 +105,8 @@ def test_a_full_disk_is_told_to_all(database):
         record_event(connection, "full", None, None)
         raise StoreFull("no room")
 
-    found, _ = together(database, [noting("a", 0), full])
-    assert [type(one) for one in found] == [StoreFull, StoreFull]
+    outcomes, _ = together(database, [noting("a", 0), full])
+    assert [type(one) for one in outcomes] == [StoreFull, StoreFull]
     assert (count(database, "a"), count(database, "full")) == (0, 0)
 
 
@@ -118,8 +118,8 @@ def test_ctrl_c_in_a_second_try_forgets_nobody(database):
         if errors:
             raise errors.pop(0)
 
-    found, _ = together(
+    outcomes, _ = together(
         database, [noting("a", 0), noting("a", 1), stop, noting("a", 3)], one_by_one=True
     )
-    assert [type(found[0]), *found[1:]] == [KeyboardInterrupt, 1, None, 3]
+    assert [type(outcomes[0]), *outcomes[1:]] == [KeyboardInterrupt, 1, None, 3]
     assert (errors, count(database, "a")) == ([], 3)

@@ -106,9 +106,9 @@ def test_the_layout_is_read_back(kind, scenes, tmp_path, run_command):
     )
     assert f"1 sites of 3 queries in {out}" in said
     site = synthesise_lookalike(kind, SEED, 0, queries=3)
-    found = find_sequences(out)
-    assert len({sequence.parent_frame for sequence in found}) == scenes
-    parts = {sequence.split: sequence for sequence in found}
+    sequences = find_sequences(out)
+    assert len({sequence.parent_frame for sequence in sequences}) == scenes
+    parts = {sequence.split: sequence for sequence in sequences}
     assert set(parts) == {"train", "test"}
     for part, frames in (("train", site.map), ("test", site.queries)):
         read = parts[part].frames

@@ -92,9 +92,9 @@ def hire(tmp_path_factory):
     def run(command, **settings):
         folder = tmp_path_factory.mktemp("crew")
         errors = tmp_path_factory.mktemp("errors") / "stderr"
-        given = {"data_dir": folder, "workers": 2, **settings}
-        names = {f"SCENEPRINT_{name.upper()}": str(value) for name, value in given.items()}
-        with Engine(Settings.model_validate(given)) as engine:
+        options = {"data_dir": folder, "workers": 2, **settings}
+        names = {f"SCENEPRINT_{name.upper()}": str(value) for name, value in options.items()}
+        with Engine(Settings.model_validate(options)) as engine:
             engine.create_map(NewMap(name="warm", model="depth"))
             with errors.open("wb") as out:
                 process = subprocess.Popen(

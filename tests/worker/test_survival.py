@@ -62,8 +62,8 @@ def add_marked(engine, frame, what):
     """Upload a frame whose focal length says what becomes of its worker; id of its job."""
     data, meta = frame
     lens = meta.intrinsics.model_copy(update={"fx": float(MARKS[what])})
-    given = meta.model_copy(update={"intrinsics": lens})
-    return engine.add_frame("hall", data, given)[0].job_id
+    own_meta = meta.model_copy(update={"intrinsics": lens})
+    return engine.add_frame("hall", data, own_meta)[0].job_id
 
 
 def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frames):

@@ -21,7 +21,7 @@ def public_names() -> list[str]:
 
 def public_methods(kind: type) -> dict[str, Callable[..., object]]:
     """Return the public methods of a class and its bases, in order of definition."""
-    found: dict[str, Callable[..., object]] = {}
+    results: dict[str, Callable[..., object]] = {}
     for base in reversed(kind.__mro__):
         if not base.__module__.startswith("sceneprint_client"):
             continue
@@ -29,8 +29,8 @@ def public_methods(kind: type) -> dict[str, Callable[..., object]]:
             one = getattr(kind, name)
             function = getattr(one, "__func__", one)
             if not name.startswith("_") and inspect.isfunction(function):
-                found[name] = function
-    return found
+                results[name] = function
+    return results
 
 
 def public_properties(kind: type) -> dict[str, str]:
@@ -86,10 +86,10 @@ def _method(owner: str, name: str, function: Callable[..., object]) -> str:
 
 def signature(name: str, function: Callable[..., object]) -> str:
     """Return a function's signature, with one parameter per line if it is long."""
-    found = inspect.signature(function)
+    result = inspect.signature(function)
     parts: list[str] = []
     before: inspect._ParameterKind | None = None
-    for parameter in found.parameters.values():
+    for parameter in result.parameters.values():
         if parameter.name in ("self", "cls"):
             continue
         if parameter.kind is parameter.KEYWORD_ONLY and before not in (
@@ -100,7 +100,7 @@ def signature(name: str, function: Callable[..., object]) -> str:
         before = parameter.kind
         parts.append(_parameter(parameter))
     # The signature of a class omits its return type.
-    returned = "" if name[:1].isupper() else f" -> {_annotation(found.return_annotation)}"
+    returned = "" if name[:1].isupper() else f" -> {_annotation(result.return_annotation)}"
     line = f"{name}({', '.join(parts)}){returned}"
     if len(line) <= _WIDTH:
         return line

@@ -13,8 +13,8 @@ from tools.site.markup import cell, code, fenced, page, plain, table
 
 def commands_page() -> str:
     """Return Markdown that describes every command with its options."""
-    found = {name: (line, one) for name, line, one in subcommands(parser())}
-    own = [name for name in found if " " not in name]
+    result = {name: (line, one) for name, line, one in subcommands(parser())}
+    own = [name for name in result if " " not in name]
     added = ", ".join(f"`{name}`" for name in own if name not in COMMANDS)
     return page(
         "# Command line",
@@ -23,9 +23,9 @@ def commands_page() -> str:
         table(
             ("command", "what it does"),
             ((f"[`{name}`](#{name.replace(' ', '-')})", cell(line))
-             for name, (line, _) in found.items()),
+             for name, (line, _) in result.items()),
         ),
-        *(_command(name, one) for name, (_, one) in found.items()),
+        *(_command(name, one) for name, (_, one) in result.items()),
     )  # fmt: skip
 
 

@@ -108,25 +108,25 @@ def read_diagram(text: str) -> Diagram:
     head = _HEAD.match(first)
     if head is None:
         raise ValueError(f"{first!r}: Start with `flowchart LR` or `flowchart TD`.")
-    found = Diagram("", head[1] == "LR")
+    diagram = Diagram("", head[1] == "LR")
     for line in rest:
         edge = _EDGE.match(line)
         alone = _ALONE.match(line)
         if line.startswith("accTitle:"):
-            found.title = line.partition(":")[2].strip()
+            diagram.title = line.partition(":")[2].strip()
         elif edge is not None:
-            source = _add_node(found, *edge.group(1, 2, 3))
-            target = _add_node(found, *edge.group(6, 7, 8))
+            source = _add_node(diagram, *edge.group(1, 2, 3))
+            target = _add_node(diagram, *edge.group(6, 7, 8))
             if source == target:
                 raise ValueError(f"{line!r}: An edge from a node to itself is not supported.")
-            found.links.append(Link(source, target, _lines(edge[5] or ""), edge[4] == "-.->"))
+            diagram.links.append(Link(source, target, _lines(edge[5] or ""), edge[4] == "-.->"))
         elif alone is not None:
-            _add_node(found, *alone.group(1, 2, 3))
+            _add_node(diagram, *alone.group(1, 2, 3))
         else:
             raise ValueError(f"{line!r} is not a node, an edge or `accTitle: ...`.")
-    if not found.title:
+    if not diagram.title:
         raise ValueError("The diagram has no title. Add a line `accTitle: ...`.")
-    return found
+    return diagram
 
 
 def _add_node(diagram: Diagram, name: str, shape: str | None, text: str | None) -> str:
@@ -165,17 +165,17 @@ def layered(diagram: Diagram) -> LayeredGraph:
     """
     backward = set(_cycle_links(diagram))
     _assign_layers(diagram, backward)
-    found = LayeredGraph(list(diagram.nodes.values()), [])
+    graph = LayeredGraph(list(diagram.nodes.values()), [])
     for number, link in enumerate(diagram.links):
         ends = [diagram.nodes[link.source], diagram.nodes[link.target]]
         if number in backward:
             ends.reverse()
         route = list(_route(ends[0], ends[1], link, number))
-        found.nodes += route[1:-1]
-        found.routes.append(route[::-1] if number in backward else route)
-    layers = _order_layers(found)
-    _place(found, layers, diagram.across)
-    return found
+        graph.nodes += route[1:-1]
+        graph.routes.append(route[::-1] if number in backward else route)
+    layers = _order_layers(graph)
+    _place(graph, layers, diagram.across)
+    return graph
 
 
 def _cycle_links(diagram: Diagram) -> Iterator[int]:
@@ -184,12 +184,12 @@ def _cycle_links(diagram: Diagram) -> Iterator[int]:
     for number, link in enumerate(diagram.links):
         leaving[link.source].append((number, link.target))
     done: set[str] = set()
-    found = []
+    links = []
 
     def visit(name: str, above: frozenset[str]) -> None:
         for number, target in leaving[name]:
             if target in above:
-                found.append(number)
+                links.append(number)
             elif target not in done:
                 visit(target, above | {target})
         done.add(name)
@@ -197,7 +197,7 @@ def _cycle_links(diagram: Diagram) -> Iterator[int]:
     for name in diagram.nodes:
         if name not in done:
             visit(name, frozenset({name}))
-    yield from found
+    yield from links
 
 
 def _assign_layers(diagram: Diagram, backward: set[int]) -> None:
@@ -225,17 +225,17 @@ def _route(source: Node, target: Node, link: Link, number: int) -> Iterator[Node
     yield target
 
 
-def _order_layers(found: LayeredGraph) -> list[list[Node]]:
+def _order_layers(graph: LayeredGraph) -> list[list[Node]]:
     """Return the order of nodes in each layer with the fewest crossings that the sweeps found."""
-    layers: list[list[Node]] = [[] for _ in range(max(node.layer for node in found.nodes) + 1)]
-    for node in found.nodes:
+    layers: list[list[Node]] = [[] for _ in range(max(node.layer for node in graph.nodes) + 1)]
+    for node in graph.nodes:
         layers[node.layer].append(node)
-    best, fewest = [list(layer) for layer in layers], crossings(layers, found.routes)
+    best, fewest = [list(layer) for layer in layers], crossings(layers, graph.routes)
     for sweep in range(24):
         step = 1 if sweep % 2 == 0 else -1
         for before, layer in pairwise(layers[::step]):
-            _sort(layer, before, found.routes)
-        count = crossings(layers, found.routes)
+            _sort(layer, before, graph.routes)
+        count = crossings(layers, graph.routes)
         if count < fewest:
             best, fewest = [list(layer) for layer in layers], count
     return best
@@ -274,13 +274,13 @@ def _mean(values: Iterable[float], default: float) -> float:
     return sum(known) / len(known) if known else default
 
 
-def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
+def _place(graph: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
     """Set the positions of nodes: layer after layer, and near their neighbours within a layer."""
     size = {node.name: (node.height, node.width) if across else (node.width, node.height)
-            for node in found.nodes}  # fmt: skip
-    beside = {node.name: 0.0 for node in found.nodes}
+            for node in graph.nodes}  # fmt: skip
+    beside = {node.name: 0.0 for node in graph.nodes}
     near: dict[str, list[str]] = defaultdict(list)
-    for route in found.routes:
+    for route in graph.routes:
         for a, b in pairwise(route):
             near[a.name].append(b.name)
             near[b.name].append(a.name)
@@ -288,7 +288,7 @@ def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
         for layer in layers[:: 1 if sweep % 2 == 0 else -1]:
             wanted = [_mean([beside[o] for o in near[one.name]], beside[one.name]) for one in layer]
             _separate(layer, wanted, beside, {one.name: size[one.name][0] for one in layer})
-    low = min(beside[node.name] - size[node.name][0] / 2 for node in found.nodes)
+    low = min(beside[node.name] - size[node.name][0] / 2 for node in graph.nodes)
     along = 2.0
     for layer in layers:
         depth = max(size[one.name][1] for one in layer)
@@ -298,8 +298,8 @@ def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
             places = beside[one.name] - low + 2.0, middle
             one.x, one.y = places[::-1] if across else places
         along += depth + (BETWEEN if depth else 0.0)
-    found.width = max(node.x + node.width / 2 for node in found.nodes) + 2.0
-    found.height = max(node.y + node.height / 2 for node in found.nodes) + 2.0
+    graph.width = max(node.x + node.width / 2 for node in graph.nodes) + 2.0
+    graph.height = max(node.y + node.height / 2 for node in graph.nodes) + 2.0
 
 
 def _separate(

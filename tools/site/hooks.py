@@ -117,10 +117,10 @@ def with_figures(text: str, page: str) -> str:
     """Return a page's text with its mermaid blocks drawn."""
     count = 0
 
-    def drawn(found: re.Match[str]) -> str:
+    def drawn(match: re.Match[str]) -> str:
         nonlocal count
         count += 1
-        diagram: Diagram = read_diagram(found[1])
+        diagram: Diagram = read_diagram(match[1])
         svg = svg_of(diagram, f"{heading_anchor(page)}-{count}")
         return f'\n<figure class="diagram" tabindex="0">{svg}</figure>\n'
 
@@ -189,5 +189,5 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     return output.replace('role="dialog"', 'role="dialog" aria-label="Search"', 1)
 
 
-def _without_escapes(found: re.Match[str]) -> str:
-    return found[0].replace("\\|", "|")
+def _without_escapes(match: re.Match[str]) -> str:
+    return match[0].replace("\\|", "|")

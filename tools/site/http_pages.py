@@ -54,13 +54,13 @@ class Operation:
 
 def operations(document: Json) -> list[Operation]:
     """Return all operations by resource, in the order of their paths."""
-    found = [
+    result = [
         Operation(method.upper(), path, body["tags"][0], body)
         for path, methods in document["paths"].items()
         for method, body in methods.items()
         if method.upper() in _METHODS
     ]
-    return sorted(found, key=lambda one: (one.resource, one.path, _METHODS.index(one.method)))
+    return sorted(result, key=lambda one: (one.resource, one.path, _METHODS.index(one.method)))
 
 
 def resource_page(name: str, document: Json) -> str:
@@ -75,18 +75,18 @@ def resource_page(name: str, document: Json) -> str:
 
 def index_page(document: Json) -> str:
     """Return Markdown that lists all operations by resource."""
-    found = operations(document)
-    names = sorted({one.resource for one in found})
+    result = operations(document)
+    names = sorted({one.resource for one in result})
     return page(
         "# HTTP API",
-        f"{len(found)} operations. Bodies and answers are described with the "
+        f"{len(result)} operations. Bodies and answers are described with the "
         f"[records]({RECORDS}); errors are [problems]({ERRORS}). A service serves the same "
         "as an OpenAPI document at `/openapi.json`, and as pages to try it at `/docs`. "
         "[The tour](../../api.md) shows the API at work with curl.",
         *(
             page(
                 f"## {name.capitalize()}",
-                _overview([one for one in found if one.resource == name], f"{name}.md"),
+                _overview([one for one in result if one.resource == name], f"{name}.md"),
             )
             for name in names
         ),

@@ -49,7 +49,7 @@ def linked_files(root: Path, pages: list[str]) -> list[str]:
     ------
     FileNotFoundError : If the target of a link is not a file of the repository.
     """
-    found: set[str] = set()
+    results: set[str] = set()
     waiting = list(pages)
     while waiting:
         page = waiting.pop()
@@ -57,11 +57,11 @@ def linked_files(root: Path, pages: list[str]) -> list[str]:
             path = posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
             if not (root / path).is_file():
                 raise FileNotFoundError(f"{page} links to {target}, which is not a file. Fix it.")
-            if not path.startswith(DOCS) and path not in found:
-                found.add(path)
+            if not path.startswith(DOCS) and path not in results:
+                results.add(path)
                 if path.endswith(".md"):
                     waiting.append(path)
-    return sorted(found)
+    return sorted(results)
 
 
 def rewrite_links(text: str, page: str) -> str:
@@ -74,10 +74,10 @@ def rewrite_links(text: str, page: str) -> str:
     """
     here = posixpath.dirname(site_path(page))
 
-    def moved(found: re.Match[str]) -> str:
-        target, mark, anchor = found[0].partition("#")
-        if not target or "://" in found[0] or target.startswith("mailto:"):
-            return found[0]
+    def moved(match: re.Match[str]) -> str:
+        target, mark, anchor = match[0].partition("#")
+        if not target or "://" in match[0] or target.startswith("mailto:"):
+            return match[0]
         path = posixpath.normpath(posixpath.join(posixpath.dirname(page), target))
         return posixpath.relpath(site_path(path), here or ".") + mark + anchor
 

@@ -50,5 +50,5 @@ def page(*parts: str) -> str:
 def first_sentence(text: str) -> str:
     """Return the first sentence of a text, or its first paragraph without a full stop."""
     paragraph = " ".join(text.split("\n\n")[0].split())
-    found = re.match(r".+?[.?!](?=\s|$)", paragraph)
-    return found[0] if found else paragraph
+    match = re.match(r".+?[.?!](?=\s|$)", paragraph)
+    return match[0] if match else paragraph

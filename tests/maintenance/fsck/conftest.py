@@ -58,9 +58,9 @@ class House:
         """Query or change the database without its checks, and without a log."""
         if self.is_sqlite:
             with closing(sqlite3.connect(self.data / "sceneprint.db")) as database:
-                found = database.execute(statement, values).fetchall()
+                rows = database.execute(statement, values).fetchall()
                 database.commit()
-            return found
+            return rows
         engine = create_engine(self.settings.database, poolclass=NullPool)
         with engine.begin() as connection:
             connection.exec_driver_sql("SET session_replication_role = replica")
@@ -96,15 +96,15 @@ class House:
         return states
 
     def answers(self, uploads, without=""):
-        found = []
+        results = []
         with Engine(self.settings) as engine:
             for each in uploads:
                 query = Query(exact=True, k=50, stages=("retrieve",))
                 answer = engine.queries.upload(["hall"], each.data, each.meta, query)
-                found.append(
+                results.append(
                     [(m.frame_id, m.distance) for m in answer.matches if m.frame_id != without]
                 )
-        return found
+        return results
 
 
 def add_products(engine):

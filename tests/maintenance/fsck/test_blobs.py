@@ -24,8 +24,8 @@ def age(path, seconds):
     os.utime(path, (then, then))
 
 
-def only(found):
-    (one,) = found
+def only(result):
+    (one,) = result
     return one
 
 
@@ -228,11 +228,11 @@ def test_old_leftovers_are_removed_and_other_files_are_not(house):
 def test_blobs_beside_a_database_that_knows_no_frame_are_left_alone(house):
     for path in house.data.glob("sceneprint.db*"):
         path.unlink()
-    kept = house.data / "kept"
-    (house.data / "blobs").rename(kept)
+    aside = house.data / "kept"
+    (house.data / "blobs").rename(aside)
     Engine(house.settings).close()  # a new, empty store; then the disk is back
     shutil.rmtree(house.data / "blobs")
-    kept.rename(house.data / "blobs")
+    aside.rename(house.data / "blobs")
     there = {path for path in (house.data / "blobs").rglob("*") if path.is_file()}
     for path in there:
         age(path, 7200)
