@@ -171,7 +171,7 @@ def test_numbers_that_no_cloud_has():
 
 
 def test_sizes_that_the_bytes_do_not_hold():
-    for data in (write_geometry(one) for one in (scan(), fused(300), spinning())):
+    for data in (write_geometry(geometry) for geometry in (scan(), fused(300), spinning())):
         for at, size in ((0, 0), (0, 65535), (2, 65535), (4, 65535), (6, 0), (6, 65535)):
             with pytest.raises(UnreadableGeometry, match="is damaged"):
                 read_geometry(sealed(data, at, struct.pack("<H", size)))

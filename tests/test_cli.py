@@ -226,7 +226,7 @@ def test_a_command_imports_only_what_it_needs():
         return set(done.stdout.splitlines()[-1].split())
 
     of_help = loaded("--version", "--help")
-    assert [one for one in of_help if one.startswith("sceneprint.cli.")] == []
+    assert [line for line in of_help if line.startswith("sceneprint.cli.")] == []
     assert (HEAVY | {"pydantic", "httpx", "sceneprint_lab.cli.demo"}) & of_help == set()
     over_http = [f"{name} --url http://127.0.0.1:9" for name in ("maps", "jobs", "queries")]
     # what the last two write as files needs no numpy either

@@ -105,7 +105,7 @@ def test_a_cloud_is_near_its_own_depth_image(small_signer, room_frames):
     depth = [sign(frame, small_signer) for frame in room_frames]
     for i, frame in enumerate(room_frames[:3]):
         cloud = sign(cloud_of(frame, i), small_signer)
-        d = [distance(cloud, one) for one in depth]
+        d = [distance(cloud, signature) for signature in depth]
         assert int(np.argmin(d)) == i
         turned_ = sign(cloud_of(frame, i, any_rotation(i)), small_signer)
         assert distance(cloud, turned_) < 0.5 * sorted(d)[1]

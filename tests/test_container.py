@@ -182,7 +182,7 @@ def test_a_part_of_the_composition_is_confined_and_told_what_is_read(name):
     if part["image"].startswith("sceneprint:"):
         ours = {variable for variable in variables if variable.removesuffix("_FILE") in SECRETS}
         unknown = variables.keys() - KNOWN_SETTINGS - ours
-        assert [one for one in unknown if not OF_LIBRARIES.fullmatch(one)] == []
+        assert [name for name in unknown if not OF_LIBRARIES.fullmatch(name)] == []
         own = {key.removeprefix("SCENEPRINT_").lower(): value for key, value in variables.items()
                if key in KNOWN_SETTINGS}  # fmt: skip
         Settings(**own)

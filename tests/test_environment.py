@@ -43,7 +43,7 @@ def test_every_dependency_has_a_reason_and_is_locked():
     reasons = (ROOT / "docs/dependencies.md").read_text()
     named = names_of([*runtime, *lab, *viewers, *chain(*extras.values(), *groups.values())])
     assert [name for name in named if name not in reasons] == []
-    running = [one for one in runtime if not one.startswith("open3d")]
+    running = [line for line in runtime if not line.startswith("open3d")]
     wanted = {
         "requirements.lock": running + extras["build"] + extras["ros"],
         "requirements-lab.lock": running + lab + viewers,

@@ -25,7 +25,7 @@ def test_the_robot_maps_a_room_and_finds_itself(tmp_path):
     alone, _, again = cabinet.partition("queried again with a prior from odometry")
     assert (alone.count("do not drive: "), "found" in alone) == (2, False)
     assert "decided by prior" in again
-    errors = [float(one) for one in re.findall(r"position error ([\d.]+) cm", output)]
+    errors = [float(text) for text in re.findall(r"position error ([\d.]+) cm", output)]
     assert max(errors) < 10
 
 
@@ -79,7 +79,7 @@ def test_a_bag_becomes_live_poses(drives, tmp_path, example):
         client.create_map("office")
         meta = {"parent_frame": mapping.parent_frame}
         added = [client.upload("office", frame, meta_of(frame, **meta)) for frame in mapping.frames]
-        client.wait([one.job_id for one in added])
+        client.wait([frame.job_id for frame in added])
     lines = example(
         "live_from_bag.py", "office", drives / "later", "--truth", drives / "later.tum",
         "--data", tmp_path,

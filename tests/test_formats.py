@@ -30,17 +30,17 @@ DEPTH = {
 
 
 def test_a_name_stands_once_in_its_kind_and_functions_are_there():
-    keys = [(one.kind, one.name) for one in FORMATS]
+    keys = [(file_format.kind, file_format.name) for file_format in FORMATS]
     assert len(set(keys)) == len(keys)
-    assert {one.name for one in formats_of("cloud")} == set(get_args(CloudFormat))
-    for one in FORMATS:
-        for place in filter(None, (one.reader, one.size)):
+    assert {file_format.name for file_format in formats_of("cloud")} == set(get_args(CloudFormat))
+    for file_format in FORMATS:
+        for place in filter(None, (file_format.reader, file_format.size)):
             assert callable(function_at(place))
-        assert (one.kind in ("depth", "cloud")) <= bool(one.reader)
+        assert (file_format.kind in ("depth", "cloud")) <= bool(file_format.reader)
 
 
 def test_every_depth_format_is_recognised_measured_and_read():
-    assert set(DEPTH) == {one.name for one in formats_of("depth")}
+    assert set(DEPTH) == {file_format.name for file_format in formats_of("depth")}
     for name, data in DEPTH.items():
         result = format_at(data, "depth", "map", "archive", "recording", "capture")
         assert result.name == name

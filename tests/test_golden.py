@@ -85,9 +85,9 @@ def shortened(document):
     operations = [method for methods in document["paths"].values() for method in methods.values()]
     shared = {"parameters": {}, "responses": {}}
     parameters = Counter(
-        (one["name"], json.dumps(one, sort_keys=True))
+        (parameter["name"], json.dumps(parameter, sort_keys=True))
         for operation in operations
-        for one in operation.get("parameters", ())
+        for parameter in operation.get("parameters", ())
     )
     responses = Counter(
         (status, json.dumps(response, sort_keys=True))
@@ -126,8 +126,8 @@ def json_text(value, key="", depth=0):
         return flat
     if isinstance(value, list):
         opening, closing = "[]"
-        members = [json_text(one, "", depth + 1) for one in value]
-        short = [isinstance(one, str) for one in value]
+        members = [json_text(member, "", depth + 1) for member in value]
+        short = [isinstance(member, str) for member in value]
     else:
         opening, closing = "{}"
         members = [json_text(value[name], name, depth + 1) for name in sorted(value)]
@@ -145,8 +145,8 @@ def json_text(value, key="", depth=0):
 def holds_list(value):
     """Return whether something within a JSON value is listed."""
     if isinstance(value, dict):
-        return any(key in LISTED or holds_list(one) for key, one in value.items())
-    return isinstance(value, list) and any(holds_list(one) for one in value)
+        return any(key in LISTED or holds_list(member) for key, member in value.items())
+    return isinstance(value, list) and any(holds_list(member) for member in value)
 
 
 def test_the_document_of_the_api(tmp_path):

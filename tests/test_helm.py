@@ -66,14 +66,14 @@ def rendered(values, folder):
     """The objects of a release `fleet`, by kind and name."""
     returned, text, error = run_helm("template", "fleet", values=values, folder=folder)
     assert returned == 0, error
-    objects = [one for one in yaml.safe_load_all(text) if one is not None]
-    by_name = {(one["kind"], one["metadata"]["name"]): one for one in objects}
+    objects = [resource for resource in yaml.safe_load_all(text) if resource is not None]
+    by_name = {(resource["kind"], resource["metadata"]["name"]): resource for resource in objects}
     assert len(by_name) == len(objects)
     return by_name
 
 
 def environment(container):
-    return {one["name"]: one["value"] for one in container["env"]}
+    return {variable["name"]: variable["value"] for variable in container["env"]}
 
 
 @pytest.mark.parametrize("values", [REQUIRED, ALL, SINGLE], ids=["required", "all", "single"])
@@ -88,9 +88,9 @@ def test_helm_and_kubernetes_accept_it(values, tmp_path):
         assert kinds == basic - {"Job"} | {"PersistentVolumeClaim"}
     else:
         assert kinds == (basic | more if values is ALL else basic)
-    for (kind, _), one in objects.items():
+    for (kind, _), resource in objects.items():
         if kind not in OF_OTHERS:
-            kubernetes_validate.validate(one, KUBERNETES, strict=True)
+            kubernetes_validate.validate(resource, KUBERNETES, strict=True)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_the_volume_of_a_single_pod_outlives_its_release(tmp_path):
     objects = rendered(SINGLE, tmp_path)
     claim = objects["PersistentVolumeClaim", "fleet-data"]
     assert claim["metadata"]["annotations"] == {"helm.sh/resource-policy": "keep"}
-    (pod,) = (one["spec"] for (kind, _), one in objects.items() if kind == "Deployment")
+    (pod,) = (resource["spec"] for (kind, _), resource in objects.items() if kind == "Deployment")
     assert (pod["replicas"], pod["strategy"]) == (1, {"type": "Recreate"})
     data = {"name": "data", "persistentVolumeClaim": {"claimName": "fleet-data"}}
     assert data in pod["template"]["spec"]["volumes"]

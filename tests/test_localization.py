@@ -251,8 +251,8 @@ def test_a_room_bears_out_the_true_pose_alone(path):
     shift, turn = poses[0].copy(), poses[0] @ about_up(90)
     shift[0, 3] += 0.6
     wrong = [score_pose([query], T, views, p, overlap_p) for T in (shift, turn)]
-    assert max(one.score for one in wrong) < 0.3 * here.score
-    assert all(one.violations + one.hidden > 0.05 or one.share < 0.1 for one in wrong)
+    assert max(place.score for place in wrong) < 0.3 * here.score
+    assert all(place.violations + place.hidden > 0.05 or place.share < 0.1 for place in wrong)
     ranked = compare_poses([query], np.stack([shift, turn, poses[0]]), views, p, overlap_p)
     np.testing.assert_allclose(ranked[0].T, poses[0], atol=0.03)
     # the pose may be that of a frame that was taken elsewhere, by odometry
@@ -419,8 +419,8 @@ def test_the_best_places_are_refined_and_hopeless_ones_left_out():
     ):
         p = replace(BY_HAND.map, **numbers)
         ranked = compare_poses([query], poses, views, p, FIXED)
-        assert [one.planes for one in ranked] == planes
-        assert [len(one.starts) for one in ranked] == refined
+        assert [place.planes for place in ranked] == planes
+        assert [len(place.starts) for place in ranked] == refined
 
 
 def test_frames_that_look_the_same_way_are_asked_first():

@@ -51,7 +51,7 @@ def test_tables_of_pages_are_those_of_the_code(path):
 def test_alerts_query_existing_metrics():
     page = (DOCS / "operations.md").read_text()
     alerts = [
-        one for one in re.findall(r"^\| `([^`]*sceneprint_[^`]*)` \|", page, re.M) if " " in one
+        text for text in re.findall(r"^\| `([^`]*sceneprint_[^`]*)` \|", page, re.M) if " " in text
     ]
     assert len(alerts) >= 9
     for alert in alerts:

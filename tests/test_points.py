@@ -45,16 +45,16 @@ def test_points_are_read_back():
     assert head["origin"] == pytest.approx(points.min(axis=0), abs=1e-6)
     assert np.add(head["origin"], head["extent"]) == pytest.approx(points.max(axis=0), abs=1e-6)
     half = np.array(head["extent"]) / 65535 / 2 + 1e-6
-    assert (abs(np.array([one["at"] for one in rows]) - points) <= half).all()
-    assert (abs(np.array([one["normal"] for one in rows]) - normals) <= 0.5 / 127 + 1e-9).all()
-    assert [one["patch"] for one in rows] == [65535 if p < 0 else p for p in patches.tolist()]
-    assert [one["residual"] for one in rows] == residuals.tolist()
+    assert (abs(np.array([row["at"] for row in rows]) - points) <= half).all()
+    assert (abs(np.array([row["normal"] for row in rows]) - normals) <= 0.5 / 127 + 1e-9).all()
+    assert [row["patch"] for row in rows] == [65535 if p < 0 else p for p in patches.tolist()]
+    assert [row["residual"] for row in rows] == residuals.tolist()
 
 
 def test_far_from_its_origin_a_cloud_keeps_its_shape():
     points = 4e6 + np.array([[0.0, 0, 0], [1, 2, 0.25], [0.5, 1, 0.25]])
     _, rows = decoded(encode_points(points))
-    apart = np.array([one["at"] for one in rows]) - rows[0]["at"]
+    apart = np.array([row["at"] for row in rows]) - rows[0]["at"]
     assert apart == pytest.approx(points - points[0], abs=1e-4)
 
 

@@ -35,7 +35,7 @@ def sentences(page):
     for part in re.split(r"\n\s*\n|\n(?=\s*(?:[*-]|\d+\.) )", page):
         text = re.sub(r"^\s*(?:[*-]|\d+\.) ", "", part)
         results += re.split(r"(?<=[.!?])[)*\"]*\s+(?=[A-Z\d(*\"]|code)", " ".join(text.split()))
-    return [one for one in results if re.search(r"\w", one)]
+    return [result for result in results if re.search(r"\w", result)]
 
 
 def words(sentence):
@@ -48,6 +48,6 @@ def test_pages_are_in_short_sentences_that_readers_do_not_stumble_over(page):
     # no index has our distributions: pip would find nothing, or a package of another owner
     assert re.findall(r"pip install (?:-\S+ )*['\"]?sceneprint", text) == []
     result = sentences(text)
-    assert [one for one in result if words(one) > MOST_WORDS] == []
+    assert [item for item in result if words(item) > MOST_WORDS] == []
     assert median(map(words, result)) <= MEDIAN_WORDS
     assert STUMBLES.findall(" ".join(result)) == []

@@ -80,7 +80,7 @@ def test_retrieval(data_root, paper):
     d, q = psi_of(database, paper), psi_of(queries, paper)
     step, metric = paper.model.quantiser_step, paper.model.metric
     stored = cross_distances(quantise(q, step), quantise(d, step), metric).astype(float)
-    exact = np.stack([np.abs(d - one).sum(axis=1) for one in q])
+    exact = np.stack([np.abs(d - signature).sum(axis=1) for signature in q])
     truth = overlaps([view_of(f) for f in queries], [view_of(f) for f in database]).mean
     first = np.take_along_axis(truth, ranks(stored), axis=1)[:, 0]
     assert truth.max(axis=1).mean() == pytest.approx(0.630, abs=0.002)

@@ -198,7 +198,7 @@ def test_of_cameras_the_least_expected_error_goes_first():
         replace(outcome(T=T), covariance=np.eye(6) * deviation**2 / 3)
         for T, deviation in ((shifted(2.0), 0.01), (np.eye(4), 0.03), (turned, 0.01))
     )
-    errors = [expected_error(one) for one in (near, far, aside)]
+    errors = [expected_error(view) for view in (near, far, aside)]
     np.testing.assert_allclose(errors, [0.01, 0.03, math.hypot(0.01, 0.02)], rtol=1e-12)
     weak = replace(near, strength="weak")
     assert rank_accepted([far, weak, near, aside, outcome("rejected")]) == [2, 3, 0, 1]
@@ -210,7 +210,7 @@ def test_of_scans_all_around_the_nearest_goes_first():
     weak = outcome(strength="weak", T=shifted(0.5))
     said = [far, weak, near, nearest]
     assert rank_accepted(said) == [0, 2, 3, 1]  # cameras: they share the same, so the order of R
-    around = [replace(one, around=True) for one in said]
+    around = [replace(text, around=True) for text in said]
     assert rank_accepted(around) == [3, 2, 0, 1]
     assert rank_accepted([*around[:3], nearest]) == [0, 2, 3, 1]  # one of a camera: not comparable
     assert rank_accepted([replace(far, around=True)]) == [0]
@@ -220,14 +220,14 @@ def test_frames_are_judged_by_the_numbers_of_their_model(room_frames, small_mode
     """Of a preset, whoever made the artifacts; of a model of one's own, once it was used."""
     query, match = (prepare(frame, small_signer)[1] for frame in room_frames[:2])
     lidar = read_model("lidar")
-    halls = [replace(one, model_id=lidar.id) for one in (query, match)]
+    halls = [replace(frame, model_id=lidar.id) for frame in (query, match)]
     p = lidar.parameters.validation
     own, outdoors, indoors = validate(*halls), validate(*halls, p=p), validate(query, match)
     assert (own.reason, own.inliers) == (outdoors.reason, outdoors.inliers)
     assert own.inliers != indoors.inliers
     strict = replace(small_model.parameters.validation, minimum_patches=10_000)
     other = replace(small_model, parameters=replace(small_model.parameters, validation=strict))
-    mine = [replace(one, model_id=other.id) for one in (query, match)]
+    mine = [replace(frame, model_id=other.id) for frame in (query, match)]
     with pytest.raises(ModelMismatch, match=r"has not been used by this process. Pass `p`"):
         validate(*mine)
     geometry = geometry_of(see(room_frames[0], other.parameters), other)

@@ -100,9 +100,9 @@ def test_a_fleet_loses_nothing_whatever_becomes_of_it(tmp_path, recording, monke
 @pytest.mark.thorough
 def test_every_operation_answers_as_declared(tmp_path, shots):
     report = call_as_everybody(tmp_path, shots[:2], examples=2, phases="fuzzing")
-    assert [one.report[-2000:] for one in report if not one.sound] == []
+    assert [service.report[-2000:] for service in report if not service.sound] == []
     assert len(report) == 5
-    assert all(one.requests > one.operations >= 40 for one in report[:4])
+    assert all(service.requests > service.operations >= 40 for service in report[:4])
 
 
 def test_what_is_lost_is_seen(tmp_path, shots, monkeypatch):

@@ -33,7 +33,7 @@ def test_scans_of_one_part_of_a_hall_are_nearer_than_others(trained):
     signed, ratios = [sign(cloud, signer) for cloud in walk[::4]], []
     for number in (7, 9, 11):
         beside = sign(walk[number], signer)
-        differ = np.array([distance(beside, one) for one in signed], float)
+        differ = np.array([distance(beside, signature) for signature in signed], float)
         near = np.linalg.norm(at[::4] - at[number], axis=1) < 5.0  # two of six
         ratios.append(differ[near].mean() / differ[~near].mean())
     assert np.mean(ratios) < 0.75  # 0.665 to 0.68 on four targets of `make test-portable`

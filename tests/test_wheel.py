@@ -52,7 +52,7 @@ def environment_without_us(folder):
     """The Python of an environment with all libraries of this one, and no sceneprint yet."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
     (there,) = folder.glob("lib/python*/site-packages")
-    for libraries in (Path(one) for one in sys.path if one.endswith("site-packages")):
+    for libraries in (Path(folder) for folder in sys.path if folder.endswith("site-packages")):
         for path in libraries.iterdir():
             if (
                 "sceneprint" not in path.name

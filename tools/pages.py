@@ -85,7 +85,7 @@ def _type_of(field: FieldInfo) -> str:
     result = [
         one for one in (get_args(field.annotation) or [field.annotation]) if one is not type(None)
     ]
-    if all(isinstance(one, str) for one in result):
+    if all(isinstance(item, str) for item in result):
         return " or ".join(map(code, result))
     if result[0] is bool:
         return "`true` or `false`"

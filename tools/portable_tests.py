@@ -66,7 +66,7 @@ def targets() -> dict[str, dict[str, str]]:
 
 def run(name: str, environment: dict[str, str]) -> bool:
     """Run the tests of a target; return whether all passed."""
-    paths = [f"tests/{one}" for one in FOLDERS] + [f"tests/test_{one}.py" for one in FILES]
+    paths = [f"tests/{name}" for name in FOLDERS] + [f"tests/test_{name}.py" for name in FILES]
     every = os.sched_getaffinity(0)
     processes = 2 if name == "one-core" else 2 * len(every)
     print(f"== {name} {environment}", flush=True)

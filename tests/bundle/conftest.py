@@ -108,10 +108,10 @@ def answers():
         free = {"query_id": "", "milliseconds": {}}
         with Engine(settings) as engine:
             return [
-                engine.queries.upload(["hall"], one.data, one.meta, Query(exact=True)).model_copy(
+                engine.queries.upload(["hall"], u.data, u.meta, Query(exact=True)).model_copy(
                     update=free
                 )
-                for one in uploads
+                for u in uploads
             ]
 
     return of

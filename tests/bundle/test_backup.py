@@ -68,7 +68,7 @@ def test_what_is_in_a_bundle(master, place, rows):
     artifacts = rows(master, "SELECT geometry FROM signatures")
     assert (len(uploads), len(artifacts)) == (5, 4)
     wanted = sorted(digest for (digest,) in uploads + artifacts)
-    assert listed == [[one, len(held[one]), None] for one in wanted]
+    assert listed == [[item, len(held[item]), None] for item in wanted]
     begun = datetime.fromisoformat(manifest.pop("created_at"))
     assert f"{begun:%Y%m%dT%H%M%S-%f}Z.json" == name
     assert 0 <= (datetime.now(UTC) - begun).total_seconds() < 3600
@@ -80,7 +80,7 @@ def test_what_is_in_a_bundle(master, place, rows):
     assert manifest == {
         "format": "sceneprint-bundle", "version": 1, "schema_revision": revision, "maps": 1,
         "frames": {"deleted": 1, "indexed": 4, "received": 1}, "signatures": 4, "blobs": 9,
-        "lost": 0, "blob_bytes": sum(len(held[one]) for one in wanted),
+        "lost": 0, "blob_bytes": sum(len(held[item]) for item in wanted),
     }  # fmt: skip
 
 
@@ -196,7 +196,7 @@ def test_old_bundles_go_with_their_parts(data, tmp_path, settings):
     os.utime(folder / "parts" / "ab" / "half#1", (0, 0))
     third = take_backup(settings(data), str(folder), keep=2)
     assert len(names_in(folder / "bundles")) == 2
-    needed = {one.digest for one in (*second.manifest.parts, *third.manifest.parts)}
+    needed = {part.digest for part in (*second.manifest.parts, *third.manifest.parts)}
     assert set(parts_in(folder)) == needed
     with pytest.raises(BundleError, match="holds no bundle"):
         verify_bundle(str(folder), gone.manifest.name)

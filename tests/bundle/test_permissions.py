@@ -22,9 +22,9 @@ def no_umask():
 def public_paths(folder):
     """What in a folder anybody but its owner may read, write or enter; its own name is `.`."""
     results = set[str]()
-    for one in (folder, *folder.rglob("*")):
+    for path in (folder, *folder.rglob("*")):
         with suppress(FileNotFoundError):  # an answer that is being written gets its name
-            results |= {str(one.relative_to(folder))} if one.stat().st_mode & 0o077 else set()
+            results |= {str(path.relative_to(folder))} if path.stat().st_mode & 0o077 else set()
     return results
 
 
@@ -48,7 +48,7 @@ def test_all_that_is_made_is_its_owners_alone(no_umask, tmp_path, uploads, setti
     take_backup(settings(data), str(tmp_path / "place"))
     restore_to_folder(str(tmp_path / "place"), tmp_path / "restored")
     closed = [tmp_path / "place", *(tmp_path / "place").glob("[bp]*s")]
-    assert [one.stat().st_mode & 0o777 for one in closed] == [0o700] * 3
+    assert [path.stat().st_mode & 0o777 for path in closed] == [0o700] * 3
     assert len(list((tmp_path / "restored").rglob("*"))) > 6
     assert public_paths(tmp_path / "restored") == set()
 

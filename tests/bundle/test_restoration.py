@@ -67,7 +67,7 @@ def test_what_is_restored_is_what_was_there(
     assert content(new) == original
     queries = uploads[:8]
     wanted = answers(settings(data), queries)
-    assert {one.status for one in wanted} >= {"found"}
+    assert {item.status for item in wanted} >= {"found"}
     assert answers(settings(new), queries) == wanted
     with Engine(settings(new)) as engine:  # the frame that waited is signed, and found
         work = engine.claim("w")
@@ -238,7 +238,7 @@ def test_there_and_back(place, data, uploads, postgres_url, tmp_path, content, a
     assert first.manifest.frames["indexed"] == SIGNED
     queries = uploads[SIGNED - 1 : SIGNED + 2]
     before = answers(settings(data), queries)
-    assert all(one.matches for one in before)
+    assert all(answer.matches for answer in before)
     back = take_backup(fleet, str(tmp_path / "back"))
     assert back.manifest.parts == first.manifest.parts  # of PostgreSQL they are the same bytes
     assert answers(fleet, queries) == before
@@ -327,7 +327,7 @@ def test_blobs_and_bundles_in_an_object_store(place, postgres_url, bucket, tmp_p
         engine.store.blobs.remove(first := min(blobs))
     assert len(blobs) == restored.manifest.blobs
     backup = take_backup(fleet, f"{bucket}/bundles", keep=1)
-    assert [(one.digest, one.why) for one in backup.lost] == [(first, "missing")]
+    assert [(blob.digest, blob.why) for blob in backup.lost] == [(first, "missing")]
     assert take_backup(fleet, f"{bucket}/bundles", keep=1).written == 0
     assert verify_bundle(f"{bucket}/bundles").lost == backup.lost
     restore_to_folder(f"{bucket}/bundles", tmp_path / "home")

@@ -24,7 +24,7 @@ def maps(service_url, whole_rooms):
         for name, which in (("near", (0, 1)), ("far", (0, 3))):
             client.create_map(name, model="depth")
             added = [client.upload(name, frames[i], wait_s=PATIENCE_S) for i in which]
-            results[name] = [one.frame_id for one in added]
+            results[name] = [frame.frame_id for frame in added]
     return results
 
 
@@ -60,8 +60,8 @@ def test_a_frame_is_localized(sceneprint, maps, whole_rooms):
     there = [
         json.loads(line) for line in sceneprint(*alone, "--json", expect=1).stdout.splitlines()
     ]
-    assert [one["status"] for one in there] == ["found", "found", "not_found"]
-    assert [one["matches"][0] for one in there[:2]] == maps["near"]
+    assert [answer["status"] for answer in there] == ["found", "found", "not_found"]
+    assert [answer["matches"][0] for answer in there[:2]] == maps["near"]
     lost = sceneprint(*alone, "--frame", 2, expect=1).stdout
     assert ": not found; none of 2 candidates is accepted" in lost
     assert lost.splitlines()[1] == "  cause: nothing_alike"
@@ -117,9 +117,9 @@ def test_frames_of_a_folder_are_asked_with_those_before_them(
     first, both, last = map(json.loads, sceneprint(*command, "--json").stdout.splitlines())
     alone = json.loads(sceneprint(*command, "--frame", 1, "--json", "--last", 1).stdout)
     # from frame 0 to frame 2 the way turns by more than 120 degrees
-    assert [one["frames"] for one in (first, both, last, alone)] == [1, 2, 2, 1]
+    assert [answer["frames"] for answer in (first, both, last, alone)] == [1, 2, 2, 1]
     assert both["votes"] > alone["votes"]  # the frame before votes too
-    here, there = (np.array(one["pose"]["matrix"]) for one in (alone, both))
+    here, there = (np.array(answer["pose"]["matrix"]) for answer in (alone, both))
     assert np.linalg.norm(here[:3, 3] - there[:3, 3]) < 0.05
     up = json.loads(sceneprint(*command, "--frame", 1, "--up", "0,-1,0", "--json").stdout)
     assert up["frames"] == 1

@@ -35,7 +35,7 @@ def test_all_entries_are_exported(sceneprint, data):
     export = ("audit", "--data", data, "--format")
     lines = sceneprint(*export, "jsonl").stdout.splitlines()
     body = [json.loads(line) for line in lines]
-    assert [(one["number"], one["action"]) for one in body] == [
+    assert [(item["number"], item["action"]) for item in body] == [
         (1, "key.created"), (2, "key.created"), (3, "key.revoked"), (4, "tenant.created"),
     ]  # fmt: skip
     assert body[0]["data"] == {
@@ -44,6 +44,6 @@ def test_all_entries_are_exported(sceneprint, data):
     file = data / "audit.log"
     assert sceneprint(*export, "syslog", "--output", file).stdout == ""
     messages = [MESSAGE.fullmatch(line) for line in file.read_text().splitlines()]
-    assert [one and one[1] for one in messages] == lines
+    assert [message and message[1] for message in messages] == lines
     sceneprint(*export, "jsonl", "--output", file, "--actor", "command")
     assert file.read_text().splitlines()[4:] == lines  # behind what was there

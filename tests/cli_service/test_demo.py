@@ -90,7 +90,7 @@ def test_demo_that_is_stopped_leaves_nothing(demo, tmp_path, whole_rooms):
 
 
 def test_signals_that_are_ignored_stay_so_and_others_are_given_back():
-    before = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGHUP)]
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)]
     try:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as `nohup` does

@@ -64,12 +64,12 @@ def test_a_key_that_may_not_see_all(sceneprint, service_url, monkeypatch):
     with Client(service_url) as client:
         few = client.create_key("doctor-few", {"nowhere": "read"}).secret
     none, few_found, wrong = findings(None), findings(few), findings("sp_wrong")
-    assert [one.subject for one in none] == ["service", "ready", "workers"]
+    assert [finding.subject for finding in none] == ["service", "ready", "workers"]
     assert "requires a key; pass one with --key" in none[-1].text
-    assert [one.subject for one in few_found] == ["service", "ready", "workers", "models"]
+    assert [finding.subject for finding in few_found] == ["service", "ready", "workers", "models"]
     assert "only to a key for all maps" in few_found[-2].text
     assert few_found[-1].text == "no maps yet"
-    assert [one.verdict for one in wrong] == ["WRONG"]
+    assert [place.verdict for place in wrong] == ["WRONG"]
 
 
 @pytest.mark.sqlite_only("a file that is damaged")
@@ -89,7 +89,7 @@ def test_what_is_wrong_says_what_to_do(sceneprint, tmp_path):
 
 
 def found_in(settings):
-    return {one.subject: one for one in doctor.machine(settings)}
+    return {finding.subject: finding for finding in doctor.machine(settings)}
 
 
 @pytest.mark.sqlite_only("what is in its file")

@@ -35,7 +35,7 @@ def test_keys_are_made_listed_and_revoked(keys, tmp_path):
     assert again.stderr.startswith("sceneprint keys: There is no key named 'robot 1'")
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
         rows = [engine.find_key(secret) for secret in secrets]
-    assert [one and (one.name, one.grants) for one in rows] == [None, ("robot 2", {"*": "admin"})]
+    assert [row and (row.name, row.grants) for row in rows] == [None, ("robot 2", {"*": "admin"})]
 
 
 def test_a_key_gets_a_new_secret_while_the_old_one_works(keys, tmp_path):
@@ -50,13 +50,13 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(keys, tmp_path):
     assert said[0].startswith("save this secret now")
     until = datetime.fromisoformat(said[1].removeprefix("the old secret works until "))
     assert timedelta(seconds=7000) < until - datetime.now(UTC) <= timedelta(hours=2)
-    assert [named(one) for one in (old, new)] == ["robot", "robot"]
+    assert [named(secret) for secret in (old, new)] == ["robot", "robot"]
     done = keys("--list")
     assert "robot  read of all, until 2" in done.stdout
     assert f", old secret until {until:%Y-%m-%dT%H:%M:%SZ}" in done.stdout
     assert done.stderr == "expiring within 7 days: robot. Create new keys with --create.\n"
     last = keys("--rotate", "robot", "--overlap", "0").stdout.strip()
-    assert [named(one) for one in (old, last)] == [None, "robot"]
+    assert [named(secret) for secret in (old, last)] == [None, "robot"]
     assert "no key named 'nobody'" in keys("--rotate", "nobody", expect=2).stderr
     refused = keys("--rotate", "robot", "--overlap", "31d", expect=2).stderr
     assert "not between 0 s and 30 days" in refused

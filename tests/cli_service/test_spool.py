@@ -48,8 +48,8 @@ def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_pat
         assert summary.startswith("poses of 6 of 7 frames; depth ")
         assert said.stderr.startswith("broken.ply: ")
         frames = list(client.frames("spooled"))
-    assert [one.robot for one in frames] == ["cart"] * 6
-    assert {one.pose.parent_frame for one in frames if one.pose} == {"cart/room-0", "cart/room-1"}
+    assert [frame.robot for frame in frames] == ["cart"] * 6
+    assert {f.pose.parent_frame for f in frames if f.pose} == {"cart/room-0", "cart/room-1"}
     lines = sceneprint("spool", spool).stdout.splitlines()
     assert lines[0] == "0 frames wait; 0.0 of 100.0 MB"
     assert lines[1] == "6 uploaded, 1 refused, 0 thinned, 0 refused and discarded"

@@ -210,7 +210,7 @@ def test_maps_are_listed_made_and_deleted(sceneprint, house):
     assert by_name["hall"][5].startswith("depth-")
     assert by_name["hall"][6:] == ["Hall", "2"]
     records = map(Map.model_validate_json, sceneprint("maps", "--json").stdout.splitlines())
-    assert {one.name: one.title for one in records}["hall"] == "Hall 2"
+    assert {record.name: record.title for record in records}["hall"] == "Hall 2"
     assert "Add --yes" in sceneprint("maps", "--delete", "hall", expect=2).stderr
     done = sceneprint("maps", "--delete", "hall", "--yes")
     assert done.stdout == "deleted map hall and its 0 frames\n"

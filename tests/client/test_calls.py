@@ -47,7 +47,7 @@ def test_jobs_are_waited_for(client, map_name, references):
     added = [client.upload(map_name, reference) for reference in references[:2]]
     added.append(client.upload(map_name, wall, lens))
     seen = []
-    ids = [one.job_id for one in added]
+    ids = [frame.job_id for frame in added]
     jobs = client.wait([*ids, ids[0]], timeout_s=PATIENCE_S, progress=lambda *n: seen.append(n))
     assert [job.job_id for job in jobs] == [*ids, ids[0]]
     assert [job.state for job in jobs] == ["succeeded", "succeeded", "failed", "succeeded"]

@@ -83,4 +83,4 @@ def test_a_folder_is_all_there_is(tmp_path, monkeypatch):
         client.create_map("m")
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
     with Client.embedded(str(tmp_path / "here")) as client:
-        assert [one.name for one in client.maps()] == ["m"]
+        assert [record.name for record in client.maps()] == ["m"]

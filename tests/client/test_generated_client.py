@@ -27,8 +27,8 @@ def test_a_generated_client_maps_and_localizes(
         [*command, "--path", document, "--config", options, "--output-path", tmp_path / "places"],
         check=True, capture_output=True, timeout=PATIENCE_S,
     )  # fmt: skip
-    names = {one["operationId"] for path in json.loads(document.read_text())["paths"].values()
-             for one in path.values()}  # fmt: skip
+    names = {operation["operationId"] for path in json.loads(document.read_text())["paths"].values()
+             for operation in path.values()}  # fmt: skip
     assert {path.stem for path in tmp_path.glob("places/api/*/*.py")} == names | {"__init__"}
     monkeypatch.syspath_prepend(tmp_path)
     places, models, types = (importlib.import_module(f"places{one}") for one in

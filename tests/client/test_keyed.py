@@ -82,4 +82,4 @@ def test_keys_are_made_listed_rotated_and_revoked(embedded):
     with pytest.raises(UnknownKey, match="'cart 9'"):
         embedded.revoke_key("cart 9")
     embedded.create_map("yard", model="depth")
-    assert [one.action for one in embedded.audit(map_name="yard")] == ["map.created"]
+    assert [line.action for line in embedded.audit(map_name="yard")] == ["map.created"]

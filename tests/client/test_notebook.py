@@ -44,9 +44,9 @@ def test_an_answer_has_a_plan_and_its_matches():
         "kind": "depth",
     }  # fmt: skip
     # 120 pixels are 4 m; y points up
-    circles = [(one.get("cx"), one.get("cy"), one.get("fill")) for one in plan.iter("circle")]
+    circles = [(mark.get("cx"), mark.get("cy"), mark.get("fill")) for mark in plan.iter("circle")]
     assert circles == [("20", "140", "none"), ("140", "80", "none")]
-    assert [one.get("d") for one in plan.iter("path")] == ["M20 140l0 -14", "M140 80l0 -14"]
+    assert [mark.get("d") for mark in plan.iter("path")] == ["M20 140l0 -14", "M140 80l0 -14"]
     assert cells(matches)[1] == ["1", f"{1:032x}", "hall", "0.75", "0.8125", "accepted"]
     assert len(cells(matches)) == 1 + 5
     assert len(answer._repr_html_()) < 2_500

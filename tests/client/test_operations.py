@@ -21,7 +21,7 @@ def test_events_that_are_kept(client, map_name, references):
     added = client.upload(map_name, references[0], wait_s=PATIENCE_S)
     client.delete_frame(map_name, added.frame_id)
     events = list(client.events(map_name, follow=False))
-    assert [(one.kind, one.frame_id) for one in events] == [
+    assert [(event.kind, event.frame_id) for event in events] == [
         ("map.created", None),
         ("frame.received", added.frame_id),
         ("frame.indexed", added.frame_id),
@@ -44,8 +44,8 @@ def test_models_and_reencoding(embedded, map_name):
     client = embedded
     created = client.create_map(map_name, model="depth")
     listed = client.models()
-    assert [one.name for one in listed][: len(PRESETS)] == list(PRESETS)
-    depth = next(one for one in listed if one.name == "depth")
+    assert [row.name for row in listed][: len(PRESETS)] == list(PRESETS)
+    depth = next(row for row in listed if row.name == "depth")
     assert depth.model_id == read_model("depth").id
     assert map_name in depth.maps
     record = client.reencode(map_name, read_model("paper").label)

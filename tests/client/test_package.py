@@ -54,13 +54,13 @@ def test_the_distributions_have_one_version():
         tomllib.loads((folder / "pyproject.toml").read_text())["project"]
         for folder in (ROOT, ROOT / "client", ROOT / "lab", ROOT / "viewers")
     )
-    versions = {one["version"] for one in (main, client, lab, viewers)}
+    versions = {project["version"] for project in (main, client, lab, viewers)}
     assert versions == {sceneprint_client.__version__}
     major, minor = client["version"].split(".")[:2]
     bounds = f">={major}.{minor},<{major}.{int(minor) + 1}"
     assert f"sceneprint-client{bounds}" in main["dependencies"]
-    for one in (lab, viewers):
-        assert f"sceneprint{bounds}" in one["dependencies"]
+    for project in (lab, viewers):
+        assert f"sceneprint{bounds}" in project["dependencies"]
     assert {dependency.partition(">")[0] for dependency in client["dependencies"]} == {
         "httpx", "numpy", "pydantic",
     }  # fmt: skip

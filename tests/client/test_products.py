@@ -45,7 +45,7 @@ def test_a_product_from_request_to_deletion(
         ids = [second.json()["job_id"], done.job_id]
         page = http.get(root, params={"limit": 1}).json()
         rest = http.get(root, params={"cursor": page["next_cursor"]}).json()
-        assert [one["job_id"] for one in page["items"] + rest["items"]] == ids
+        assert [item["job_id"] for item in page["items"] + rest["items"]] == ids
         for status, method, path, more in (
             (404, "GET", f"{root}/{'0' * 32}", {}),
             (404, "GET", f"/v1/maps/nowhere/{kind.collection}/{done.job_id}", {}),

@@ -144,7 +144,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(views, tmp_p
         coverage = client.product(Reconstruction, None, begun.job_id).result
         sources = {view.frame_id: view.source for view in coverage.views}
         assert sources[lost] == "geometry"
-        assert [one.frame_id for one in coverage.left_out] == [deleted]
+        assert [frame.frame_id for frame in coverage.left_out] == [deleted]
         assert "replaced by a new frame" in coverage.left_out[0].reason
         # what the query saw is not kept beyond the job, and all goes with it
         before = files(tmp_path)

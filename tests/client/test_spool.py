@@ -280,7 +280,7 @@ def test_what_waits_is_uploaded_and_refusals_are_set_aside(remote, map_name, ref
         assert now.bytes == CHARGE
         frames = list(remote.frames(map_name))
         assert frames[0].frame_id == there.frame_id
-        assert [one.name for one in frames[1:]] == [
+        assert [frame.name for frame in frames[1:]] == [
             *(reference.path.name for reference in references[1:3]), "last",
         ]  # fmt: skip
         assert frames[-1].captured_at == START
@@ -428,7 +428,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path):
         said = add_until(path, first, count, count if room else chance.randrange(1, 150), room)
         full += said[-1:] == ["full"]
         kills += said[-1:] != ["full"]
-        numbers = [int(one) for one in said if one != "full"]
+        numbers = [int(text) for text in said if text != "full"]
         assert numbers == list(range(first, first + len(numbers)))
         first += len(numbers)  # one more may be durable: it is added again
     assert names(path) == [str(number) for number in range(count)]

@@ -153,7 +153,7 @@ def test_a_thread_asks_for_the_latest_frame_alone():
         assert not tracker.wait(0)
         client.may_answer.set()
         assert tracker.wait(PATIENCE_S)
-        assert [one["frames"] for one in client.requests] == [[0.0], [3.0]]
+        assert [request["frames"] for request in client.requests] == [[0.0], [3.0]]
         assert tracker.dropped == 2
         state = tracker.submit(depth(4), ahead(4), stamp=4.0)
         assert (state.status, state.age) == ("tracking", 1.0)
@@ -204,7 +204,7 @@ def asked_with(tracker, xs, client):
     """Depths of the frames of each question; the depth of a frame is its place on the way."""
     for i, x in enumerate(xs):
         tracker.update(depth(x), ahead(x), stamp=float(i))
-    return [one["frames"] for one in client.requests]
+    return [request["frames"] for request in client.requests]
 
 
 def test_while_it_is_lost_it_asks_with_the_latest_frames_that_differ():
@@ -258,10 +258,10 @@ def test_frames_that_were_not_answered_or_are_old_are_not_sent_again():
     assert asked_with(tracker, [1, 2], client) == [[1.0], [1.0, 2.0]]
     client.answers[3:] = [errors.UselessFrame("blank"), not_found]
     assert tracker.update(depth(2.5), ahead(2.5), stamp=2.0).reason == "blank"
-    assert [one["frames"] for one in client.requests[2:]] == [[1.0, 2.5], [2.5]]
+    assert [request["frames"] for request in client.requests[2:]] == [[1.0, 2.5], [2.5]]
     tracker.update(depth(3), ahead(3), stamp=3.0)
     tracker.update(depth(3.5), ahead(3.5), stamp=32.0)  # 32 s after the first
-    assert [one["frames"] for one in client.requests[4:]] == [[1.0, 3.0], [3.0, 3.5]]
+    assert [request["frames"] for request in client.requests[4:]] == [[1.0, 3.0], [3.0, 3.5]]
 
 
 @pytest.mark.parametrize("error", [errors.UselessFrame("blank"), errors.TooLarge("3 MB")])
@@ -309,10 +309,10 @@ def test_beside_what_looks_alike_it_never_tracks_wrongly(client, map_name, kind,
     camera = camera_of((k.fx, k.fy, k.cx, k.cy), (k.width, k.height))
     client.create_map(map_name, model="depth")
     jobs = []
-    for one in site.map:
-        pose = GivenPose(parent_frame="building", matrix=one.pose.tolist())
+    for view in site.map:
+        pose = GivenPose(parent_frame="building", matrix=view.pose.tolist())
         meta = FrameMeta(intrinsics=camera, session="walk", pose=pose)
-        jobs.append(client.upload(map_name, one.depth, meta).job_id)
+        jobs.append(client.upload(map_name, view.depth, meta).job_id)
     client.wait(jobs)
     tracker = Tracker(client, map_name, camera=camera)
     truth = [query.pose for query in site.queries]

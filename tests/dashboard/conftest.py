@@ -355,7 +355,7 @@ def settle():
         busy = "() => document.getElementById('main')?.getAttribute('aria-busy') !== 'false'"
         end, quiet = time.monotonic() + PATIENCE_S, 0
         while quiet < 3:  # an answer may cause further requests
-            assert time.monotonic() < end, [one.url for one in page.pending]
+            assert time.monotonic() < end, [request.url for request in page.pending]
             page.wait_for_timeout(20)
             quiet = 0 if page.pending or page.evaluate(busy) else quiet + 1
 

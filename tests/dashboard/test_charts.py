@@ -48,8 +48,8 @@ def test_a_chart_reads_out_what_the_keys_point_at_and_keeps_it(call, page):
     """)  # fmt: skip
     plot = page.get_by_role("slider", name="Apples")
     heights = lambda: [  # noqa: E731
-        round(float(one.get_attribute("height")), 2)
-        for one in plot.locator("svg rect:not(.chart-cursor)").all()
+        round(float(bar.get_attribute("height")), 2)
+        for bar in plot.locator("svg rect:not(.chart-cursor)").all()
     ]
     # 118 px for 6: red of minutes 0, 2, 3, then green of 0, 1, 3
     assert heights() == [19.67, 98.33, 39.33, 59, 78.67, 19.67]

@@ -60,17 +60,17 @@ def test_a_result_is_begun_shown_and_explained(station, page, settle, measured, 
         expect(count).to_have_text(str(result[name]))
     drawn = page.locator(".cover-cell").evaluate_all(CELLS)
     cells = {key(cell): cell for cell in plan["cells"]}
-    assert {one["cell"] for one in drawn} == set(cells)
-    for one in drawn:
-        cell = cells[one["cell"]]
-        assert [one["x"], one["y"]] == pytest.approx([cell["column"] * 0.5, cell["row"] * 0.5])
-        assert one["width"] == 0.5
+    assert {mark["cell"] for mark in drawn} == set(cells)
+    for mark in drawn:
+        cell = cells[mark["cell"]]
+        assert [mark["x"], mark["y"]] == pytest.approx([cell["column"] * 0.5, cell["row"] * 0.5])
+        assert mark["width"] == 0.5
         counts = {name: cell[name] for name in OUTCOMES}
         if not sum(counts.values()):
-            assert one["outcome"] == "none"
+            assert mark["outcome"] == "none"
         else:
             worst = max(("not_found", "ambiguous", "found"), key=lambda name: counts[name])
-            assert one["outcome"] == ("wrong" if counts["wrong"] else worst)
+            assert mark["outcome"] == ("wrong" if counts["wrong"] else worst)
     # the cell of a frame that is mistaken: what stands in it, and what each looks like
     frame = next(frame for frame in measured["frames"] if frame["look_alikes"])
     axes = np.array([plan["x_axis"], plan["y_axis"]])

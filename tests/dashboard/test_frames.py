@@ -231,7 +231,7 @@ def test_frames_are_found_selected_changed_and_restored(page, station, settle, u
 
     def sessions():
         body = station.client.get(f"{path}/sessions").json()["items"]
-        return {one["session"]: sum(one["frames"].values()) for one in body}
+        return {item["session"]: sum(item["frames"].values()) for item in body}
 
     page.goto(f"{station.home}#/maps/picked")
     settle(page)

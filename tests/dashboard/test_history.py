@@ -49,7 +49,7 @@ def test_the_rows_are_the_records_and_filters_are_in_the_address(
     listing = records(station)
     rows = page.evaluate(ROWS)
     assert [(row["id"], row["status"]) for row in rows] == [
-        (one["query_id"], one["status"]) for one in listing
+        (row["query_id"], row["status"]) for row in listing
     ]
     assert [row["status"] for row in rows] == ["failed", "not_found", "found", "found"]
     failed, lost, second, first = (row["cells"] for row in rows)
@@ -63,19 +63,19 @@ def test_the_rows_are_the_records_and_filters_are_in_the_address(
     assert first[3] == f"{there}\nm in room-0"
     assert first[4] == str(answers[0]["location"]["support"])
     assert [row["answer"] for row in rows] == [
-        None, *(f"#/queries/{one['query_id']}" for one in reversed(answers))
+        None, *(f"#/queries/{answer['query_id']}" for answer in reversed(answers))
     ]  # fmt: skip
     assert axe(page) == []
     page.select_option("#queries-status", "lost")
     settle(page)
     assert page.url.endswith("#/maps/seen/queries?status=lost")
-    assert [one["status"] for one in page.evaluate(ROWS)] == ["failed", "not_found"]
+    assert [row["status"] for row in page.evaluate(ROWS)] == ["failed", "not_found"]
     page.reload()
     settle(page)
-    assert [one["status"] for one in page.evaluate(ROWS)] == ["failed", "not_found"]
+    assert [row["status"] for row in page.evaluate(ROWS)] == ["failed", "not_found"]
     page.goto(f"{station.home}#/maps/seen/queries?robot=spot&last=1")
     settle(page)
-    assert [one["id"] for one in page.evaluate(ROWS)] == [answers[0]["query_id"]]
+    assert [row["id"] for row in page.evaluate(ROWS)] == [answers[0]["query_id"]]
     page.goto(f"{station.home}#/maps/seen/queries?until={listing[-1]['at']}")
     settle(page)
     assert page.locator(".state h2").inner_text() == "No queries match"
@@ -101,5 +101,5 @@ def test_new_queries_are_announced_and_looking_leaves_none(station, answers, pag
     page.get_by_role("button", name="Show 2 new queries").click()
     settle(page)
     rows = page.evaluate(ROWS)
-    assert [one["id"] for one in rows] == [one["query_id"] for one in records(station)]
+    assert [row["id"] for row in rows] == [row["query_id"] for row in records(station)]
     assert len(rows) == len(before) + 2

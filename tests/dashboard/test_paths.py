@@ -54,9 +54,9 @@ def test_runs_are_joined_from_here(page, apart, station, settle):
         "carol · 1 frame: no poses",
         "bob · 4 frames: poses in bob/odom, which no association joins to ann/odom",
     ])  # fmt: skip
-    (thinned,) = [parse_qs(one.query) for one in urls if one.path.endswith("/trajectory")]
+    (thinned,) = [parse_qs(url.query) for url in urls if url.path.endswith("/trajectory")]
     assert int(thinned["most"][0]) <= 2000  # however many there are
-    lists = [parse_qs(one.query) for one in urls if one.path.endswith("/frames")]
+    lists = [parse_qs(url.query) for url in urls if url.path.endswith("/frames")]
     assert [one["limit"] for one in lists] == [["1"]]
     page.get_by_role("button", name="New association…").click()
     dialog = page.get_by_role("dialog")

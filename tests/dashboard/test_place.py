@@ -78,7 +78,7 @@ def test_a_spot_names_the_frames_that_saw_it(page, station, built, settle, axe, 
     section = page.locator("section", has=page.locator("#place-spot"))
     expect(section.locator("[role=status]")).to_contain_text("frame")
     settle(page)
-    (sent,) = [parse_qs(one.query) for one in urls if one.path.endswith("/surface/frames")]
+    (sent,) = [parse_qs(url.query) for url in urls if url.path.endswith("/surface/frames")]
     assert np.array(sent["at"][0].split(","), float) == pytest.approx(spot, abs=0.06)
     frames = station.client.get(
         f"{built['path']}/frames", params={name: values[0] for name, values in sent.items()}
@@ -86,7 +86,7 @@ def test_a_spot_names_the_frames_that_saw_it(page, station, built, settle, axe, 
     assert frames
     links = section.locator(".place-frames .paths-told a:first-child")
     hrefs = links.evaluate_all("all => all.map((one) => one.getAttribute('href'))")
-    assert hrefs == [f"#/maps/building/frames/{one['frame_id']}" for one in frames]
+    assert hrefs == [f"#/maps/building/frames/{frame['frame_id']}" for frame in frames]
     assert axe(page) == []
 
 

@@ -212,8 +212,8 @@ def test_the_plan_and_the_overlay_are_on_the_first_screen(station, page, ask, se
     page.set_viewport_size({"width": 1440, "height": 900})
     answer = ask(why="")
     plan, inset = page.locator(".query-plan .plan"), page.locator(".query-inset-canvas")
-    for one in (page.locator(".query-verdict"), plan, inset):
-        box = one.bounding_box()
+    for element in (page.locator(".query-verdict"), plan, inset):
+        box = element.bounding_box()
         assert box["y"] + box["height"] <= 900
     assert page.locator(".query-row").count() == 0  # folded, and not drawn before it is asked for
     # the room's z is up: x and y are those of the plan, and a camera looks along its own z
@@ -234,10 +234,10 @@ def test_the_plan_and_the_overlay_are_on_the_first_screen(station, page, ask, se
     assert page.locator(".plan .query-vote-line").count() == len(voting)
     # each match stands where its frame was taken
     taken = {frame.frame_id: frame.meta["pose"]["matrix"] for frame in station.frames}
-    for one in voting:
-        mark = page.locator(f".plan .query-spot-match[data-key='{key(one)}']")
+    for match in voting:
+        mark = page.locator(f".plan .query-spot-match[data-key='{key(match)}']")
         x, y, _ = map(float, re.findall(r"-?[\d.]+", mark.get_attribute("transform")))
-        own = np.array(taken[one["frame_id"]])
+        own = np.array(taken[match["frame_id"]])
         assert [x, y] == pytest.approx(at(view, *own[:2, 3]), abs=0.15 * view[2])
 
 
@@ -363,7 +363,7 @@ def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
     settle(page)
     answer = shown(station, page)
     assert len(accepted(answer)) == 1
-    assert [one.partition("/v1/")[2] for one in sent] == [
+    assert [path.partition("/v1/")[2] for path in sent] == [
         "maps/building/queries", "queries",
     ]  # fmt: skip
     assert first["query_id"] != answer["query_id"]

@@ -32,8 +32,8 @@ def test_the_first_page_is_small_and_asks_for_nothing_long(station, page, settle
     assert sum(code.values()) <= BUDGET, code
     assert set(code) >= {"/dashboard", "/dashboard/main.js", "/dashboard/maps/maps.js"}
     # a list of frames is none of the first page's, nor of any map that is not in view
-    kinds = {re.sub("/v1/maps/[^/]+/surface(/plan.png)?", "plan", one.partition("?")[0])
-             for one in paths}  # fmt: skip
+    kinds = {re.sub("/v1/maps/[^/]+/surface(/plan.png)?", "plan", path.partition("?")[0])
+             for path in paths}  # fmt: skip
     assert kinds <= {
         "/", "/v1/keys/me", "/v1/maps", "/v1/jobs", "/v1/queries", "/v1/events", "plan"
     }  # fmt: skip

@@ -158,7 +158,7 @@ def test_frames_have_the_numbers_and_names_of_their_files(kitchen, tmp_path):
 def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen):
     def places(found, session):
         sequences = numbered_sequences(found, session)
-        return [[frame.sequence for frame in one.frames] for one in sequences]
+        return [[frame.sequence for frame in sequence.frames] for sequence in sequences]
 
     runs = find_sequences(kitchen)
     assert places(runs, None) == [[0, 1], [0, 1], [0, 1]]

@@ -184,7 +184,7 @@ def concluded(here, there, off, scale=1.0):
     result, counts, joins = finish_association(
         actual, *runs, stops, NewAssociation(sessions=["a", "b"]), scale
     )
-    return [one["consistent"] for one in result], counts, joins
+    return [item["consistent"] for item in result], counts, joins
 
 
 def test_an_edge_needs_a_second_one_from_elsewhere():

@@ -144,7 +144,7 @@ def test_events_tell_what_was_edited(full):
     edit_map(full.store, "hall", {"title": "The hall"})
     edit_map(full.store, "hall", {"title": "The hall"})
     actual = full.events.page(full.events.wanted("hall", ["frame.edited", "map.edited"])).items
-    assert [(one.kind, one.frame_id, one.data) for one in actual] == [
+    assert [(item.kind, item.frame_id, item.data) for item in actual] == [
         ("frame.edited", name, {"fields": ["robot"]}),
         ("map.edited", None, {"fields": ["title"]}),
     ]

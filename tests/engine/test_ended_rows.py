@@ -28,7 +28,7 @@ def after(engine, days):
 
 def rows(engine):
     result = engine.fetch(select(frames.c.id, frames.c.state).order_by(frames.c.number))
-    return [(one[0], one[1]) for one in result]
+    return [(item[0], item[1]) for item in result]
 
 
 def matches_of(engine, uploads):

@@ -96,16 +96,16 @@ def test_all_dead_jobs_are_tried_again_page_by_page(empty, uploads):
     for _ in added:
         while die(empty, empty.claim("w")) != JobState.DEAD:
             empty.make_due()
-    ids = [one.job_id for one in added]
+    ids = [frame.job_id for frame in added]
     empty.store.blobs.remove(empty.store.blobs.put(uploads[1].data))
     empty.retry_job(ids[3])  # by hand, before, and with success
     assert empty.run(empty.claim("w")) == JobState.SUCCEEDED
     first = empty.retry_dead_jobs(limit=2)  # the newest: 3, which has a follower, and 2
-    assert [one.frame_id for one in first.retried] == [added[2].frame_id]
+    assert [frame.frame_id for frame in first.retried] == [added[2].frame_id]
     assert first.refused == []
     second = empty.retry_dead_jobs(first.next_cursor, limit=2)
-    assert [one.frame_id for one in second.retried] == [added[0].frame_id]
-    assert [one.job_id for one in second.refused] == [ids[1]]
+    assert [frame.frame_id for frame in second.retried] == [added[0].frame_id]
+    assert [frame.job_id for frame in second.refused] == [ids[1]]
     assert "is missing" in second.refused[0].reason
     assert second.next_cursor is None
     waiting = {job.job_id for job in list_jobs(empty.store, JobState.QUEUED).items}
@@ -113,7 +113,7 @@ def test_all_dead_jobs_are_tried_again_page_by_page(empty, uploads):
     counted = {"dead": 1, "queued": 2, "succeeded": 1}  # of retried jobs only the latest
     assert empty.statistics.collect(1, "hall").jobs == counted == empty.statistics.collect(1).jobs
     again = empty.retry_dead_jobs()
-    assert (again.retried, [one.job_id for one in again.refused]) == ([], [ids[1]])
+    assert (again.retried, [frame.job_id for frame in again.refused]) == ([], [ids[1]])
     assert empty.retry_dead_jobs(map_names=("elsewhere",)).refused == []
 
 
@@ -161,7 +161,7 @@ def png(samples):
 def changes(engine):
     with engine.store.database.read() as connection:
         row = find_map(connection, "hall")
-        return [one for block in changes_since(connection, row, 0) for one in block]
+        return [change for block in changes_since(connection, row, 0) for change in block]
 
 
 def test_a_frame_with_nothing_to_sign_is_rejected_with_the_reason(empty, uploads):

@@ -101,10 +101,10 @@ def test_a_pulled_map_answers_as_the_service_and_follows_it(robot, walk):
     first = robot.pull()
     assert (first.frames, first.written, first.removed, first.artifacts) == (5, 5, 0, 5)
     online = answers(service, queries)
-    assert [one["status"] for one in online[:3]].count("found") >= 2
+    assert [answer["status"] for answer in online[:3]].count("found") >= 2
     assert robot.answers(queries) == online
     with Client.embedded(robot.folder) as client:
-        assert [one.name for one in client.maps()] == [MAP]
+        assert [record.name for record in client.maps()] == [MAP]
         result = client.map(MAP)
         assert (result.title, result.created_at) == ("The hall", service.map(MAP).created_at)
     again = robot.pull()
@@ -217,7 +217,7 @@ def test_a_copy_is_one_state_of_a_map_that_changes(robot, walk, monkeypatch):
     assert actual.revision == service.map(MAP).revision
     with Client.embedded(robot.folder) as client:
         living = [frame for frame in client.frames(MAP) if frame.state == "indexed"]
-        assert {one.frame_id for one in living} == set(ids[1:])
+        assert {frame.frame_id for frame in living} == set(ids[1:])
         assert client.frame(MAP, ids[5]).tags == ["dark"]
     again = robot.pull()
     assert (again.written, again.removed) == (0, 0)

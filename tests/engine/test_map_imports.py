@@ -100,7 +100,7 @@ def test_a_room_becomes_a_map_in_which_it_is_found(chosen):
     there = localization_of(chosen.query_frame("hall", frames[0].frame_id, query))
     assert (there.evidence or there.alternatives[0].evidence).rendered
     items = chosen.imports.items("hall", job_id, limit=1000).items
-    assert {one.frame_id for one in items} - {None} == {one.frame_id for one in frames}
+    assert {item.frame_id for item in items} - {None} == {item.frame_id for item in frames}
 
 
 def test_a_slice_that_was_lost_adds_nothing_twice(chosen, monkeypatch):
@@ -172,7 +172,7 @@ def test_files_in_one_parent_frame_need_one_offset(empty):
 
     def places():
         listed = empty.list_frames("hall", limit=1000).items
-        return {one.name: np.array(one.pose.matrix)[:3, 3] for one in listed}
+        return {row.name: np.array(row.pose.matrix)[:3, 3] for row in listed}
 
     slices(FAR, "west.obj", 3)
     west = places()

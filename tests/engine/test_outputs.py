@@ -155,9 +155,9 @@ def test_pages_of_sessions(empty, uploads):
     rest = list_sessions(empty.store, "hall", page.next_cursor, 9)
     actual = [*page.items, *rest.items]
     assert (len(page.items), rest.next_cursor) == (2, None)
-    assert [one.session for one in actual] == [None, "s1", "s2", "s3", "s4"]
-    assert [one.parent_frames for one in actual] == [["room-000"]] * 5
-    assert [one.frames for one in actual] == [{"received": 1}] * 5
+    assert [item.session for item in actual] == [None, "s1", "s2", "s3", "s4"]
+    assert [item.parent_frames for item in actual] == [["room-000"]] * 5
+    assert [item.frames for item in actual] == [{"received": 1}] * 5
     lone = base64.urlsafe_b64encode(b'["\\ud800", ""]').decode()
     for bad in ("0", "%", "W10", "WzEsIDJd", "[" * 2000, lone, "é"):
         with pytest.raises(InvalidRequest, match="is not valid"):

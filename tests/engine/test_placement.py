@@ -62,9 +62,9 @@ def test_frames_are_found_by_where_they_were_taken(full, uploads):
                 if np.abs(at - poses[2]).max() <= within
             )
             actual = near(poses[2], within)
-            assert [one.number for one in actual] == [i + 1 for _, i in by_hand]
-            for one in actual:
-                np.testing.assert_allclose(one.pose, uploads[one.number - 1].pose, atol=1e-12)
+            assert [item.number for item in actual] == [i + 1 for _, i in by_hand]
+            for item in actual:
+                np.testing.assert_allclose(item.pose, uploads[item.number - 1].pose, atol=1e-12)
         assert [one.number for one in near(poses[2], 5.0, most=2)] == [3, by_hand[1][1] + 1]
         assert near(poses[2] + 50.0, 5.0) == []
         assert near(poses[2], 5.0, room="nowhere") == []

@@ -205,8 +205,8 @@ def test_readers_let_go_of_what_was_deleted(empty, uploads):
 
 def test_what_a_snapshot_or_a_crash_left_goes_later(empty, uploads):
     engine, (a, b, *_) = empty, uploads
-    for one in (a, b):
-        engine.add(one)
+    for shot in (a, b):
+        engine.add(shot)
     first, second = (frame.frame_id for frame in engine.list_frames("hall").items)
     with engine.store.blobs.locks.block_removals():  # as while a snapshot is being taken
         engine.delete_frame("hall", first)

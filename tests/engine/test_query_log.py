@@ -162,8 +162,8 @@ def test_pages_and_filters(engine):
             engine.query_log.page(EVERY, None, forged, 2)
     with engine.store.database.read() as connection:
         actual = list_events(connection, EventFilter(kinds=("query.",)))
-    assert [int(one.data["query_id"], 16) for one in actual] == list(range(7))
-    assert [one.map for one in actual] == ["hall"] * 3 + ["attic"] + ["hall"] * 3
+    assert [int(item.data["query_id"], 16) for item in actual] == list(range(7))
+    assert [item.map for item in actual] == ["hall"] * 3 + ["attic"] + ["hall"] * 3
 
 
 def test_recent_queries_are_counted_by_map_and_status(engine):

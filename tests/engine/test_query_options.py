@@ -70,10 +70,10 @@ def test_thresholds_decide_what_is_accepted(full):
     name = full.ids()[0]
     before = {match.frame_id: match.validation for match in ask(full, name, k=50).matches}
     accepted = {one for one, v in before.items() if v.status == "accepted"}
-    least = sorted(before[one].overlap for one in accepted)[1]
+    least = sorted(before[match].overlap for match in accepted)[1]
     after = ask(full, name, k=50, validation={"evidence": least, "violation_weight": 0.0})
     still = {match.frame_id for match in after.matches if match.validation.status == "accepted"}
-    assert still == {one for one in accepted if before[one].overlap >= least} != accepted
+    assert still == {match for match in accepted if before[match].overlap >= least} != accepted
     sure = ask(full, name, k=50, validation={"strong": 1.0})
     assert {match.validation.strength for match in sure.matches[: len(accepted)]} == {"weak"}
     assert {match.frame_id for match in sure.matches[: len(accepted)]} == accepted
@@ -162,10 +162,10 @@ def test_every_frame_of_the_ranking_is_explained(full, prepared):
         plain, answer = ask(full, names[0], **how), ask(full, names[0], **how, explain=True)
         assert fields(answer, "explanations") == fields(plain, "explanations")
         actual = answer.explanations
-        assert [(one.rank, one.frame_id) for one in actual] == list(enumerate(ranked, 1))
+        assert [(item.rank, item.frame_id) for item in actual] == list(enumerate(ranked, 1))
         matches = {match.frame_id: match for match in answer.matches}
         # accepted ones beyond `k` are not listed
-        chosen = {*matches, *(one.frame_id for one in actual if one.outcome == "accepted")}
+        chosen = {*matches, *(item.frame_id for item in actual if item.outcome == "accepted")}
         assert len(chosen) == candidates
         for one in actual:
             outcomes.add(one.outcome)

@@ -39,7 +39,7 @@ def test_a_map_takes_what_its_quota_allows(empty, uploads):
     assert used(empty) == MapUsage(1, len(a.data) + len(b.data))  # it can be restored
     assert empty.tombstones.purge(everything=True) == 1
     assert used(empty) == MapUsage(1, len(b.data))
-    batch = [Upload(one.data, one.meta) for one in (b, c, d)]
+    batch = [Upload(shot.data, shot.meta) for shot in (b, c, d)]
     outcomes, _ = empty.uploads.add_all("hall", batch)
     assert [outcome.new for outcome in outcomes] == [False, True, False]
     assert isinstance(outcomes[2].error, QuotaExceeded)
@@ -116,7 +116,7 @@ def test_what_had_no_room_is_taken_when_it_is_sent_again(empty, uploads):
         with pytest.raises(QuotaExceeded):
             empty.uploads.add("hall", Upload(a.data, a.meta), once)
     limit(empty, quota_frames=1)
-    batch = [Upload(one.data, one.meta) for one in (a, b)]
+    batch = [Upload(shot.data, shot.meta) for shot in (a, b)]
     other = IdempotentRequest("robot", "other", "e" * 64)
     (first, second), again = empty.uploads.add_all("hall", batch, other)
     assert (first.new, second.added, again) == (True, None, False)

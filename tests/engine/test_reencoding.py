@@ -376,7 +376,7 @@ def test_a_rejected_frame_is_gone_for_readers_that_knew_it(
     other = (at + 1) % 12
     wanted = right(names, by_model, full.get_map("hall").model, other)
     answer = sleeper.ask(uploads[other], R)
-    assert matches_of(answer) == [one for one in wanted if one[0] != blind.frame.id]
+    assert matches_of(answer) == [item for item in wanted if item[0] != blind.frame.id]
     # what one model rejects another has to look at: it is found again
     assert full.get_frame("hall", blind.frame.id).state == FrameState.RECEIVED
     assert full.work_off() == [JobState.SUCCEEDED]

@@ -238,7 +238,7 @@ def test_damage_is_told_and_what_can_be_made_again_is(full):
     assert row.damaged == 5
     wanted = full.events.wanted("hall", ["frame.damaged"])
     actual = full.events.page(wanted).items
-    assert {(one.frame_id, one.data.get("upload", False)) for one in actual} == {
+    assert {(item.frame_id, item.data.get("upload", False)) for item in actual} == {
         (ids[1], False), (ids[2], False), (ids[3], True), (ids[4], False),
     }  # fmt: skip
     assert uploads[3].exists()  # nothing is moved while nobody looks

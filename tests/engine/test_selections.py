@@ -48,7 +48,7 @@ def of_sessions(empty, uploads):
 def known(engine):
     """Session, robot and tags of all frames by their ids."""
     actual = engine.list_frames("hall", None, 100).items
-    return {one.frame_id: (one.session, one.robot, sorted(one.tags)) for one in actual}
+    return {item.frame_id: (item.session, item.robot, sorted(item.tags)) for item in actual}
 
 
 def delete(engine, **wanted):
@@ -92,8 +92,8 @@ def test_a_call_that_runs_out_of_time_says_what_is_left(empty, ids):
         delete_selection(empty.store, "hall", wanted, empty.tombstones, seconds=0.0)
         for _ in range(4)
     ]
-    assert [(one.frames, one.remaining) for one in result] == [(2, 3), (2, 1), (1, 0), (0, 0)]
-    assert [one.deletion and one.deletion.frames for one in result] == [2, 2, 1, None]
+    assert [(item.frames, item.remaining) for item in result] == [(2, 3), (2, 1), (1, 0), (0, 0)]
+    assert [item.deletion and item.deletion.frames for item in result] == [2, 2, 1, None]
     for one in result[:3]:
         empty.tombstones.restore("hall", one.deletion.deletion_id)
     assert list(known(empty)) == ids
@@ -200,10 +200,10 @@ def test_tags_are_added_once_and_removed(empty, of_sessions):
     tags = [frame.tags for frame in frames(empty).values()]
     assert tags == [["old", "new"]] * 5 + [["old"]] * 7
     listed = list_sessions(empty.store, "hall", None, 10).items
-    assert [(one.session, one.robot, one.tags) for one in listed] == [
+    assert [(row.session, row.robot, row.tags) for row in listed] == [
         (None, "r1", ["old"]), ("a", "r1", ["new", "old"]), ("a", "r2", ["old"]),
         ("a/..", "r1", ["old"]),
     ]  # fmt: skip
     edit_session(empty.store, "hall", "a", SessionEdit(remove_tags=["old"]))
     actual = empty.list_frames("hall", None, 100, wanted=FrameListing(tag=["old"])).items
-    assert [one.frame_id for one in actual] == of_sessions[8:]
+    assert [item.frame_id for item in actual] == of_sessions[8:]

@@ -55,12 +55,12 @@ def test_the_ranking_is_that_of_both_maps_together(two, uploads):
 def test_a_pose_is_of_one_map(two, uploads):
     both = ask(two, MAPS, uploads[8], k=50, candidates=50, stages=["retrieve", "validate"])
     accepted = [match for match in both.matches if match.validation.status == "accepted"]
-    counts = {name: sum(one.map == name for one in accepted) for name in MAPS}
+    counts = {name: sum(match.map == name for match in accepted) for name in MAPS}
     assert min(counts.values()) >= 1
     assert {name: part.counts.accepted for name, part in both.per_map.items()} == counts
     assert both.counts.accepted == sum(counts.values())
     # both maps call the parent frame the same, and still only the one with most strong votes
-    assert {one.pose_in_map.parent_frame for one in accepted} == {uploads[8].room}
+    assert {match.pose_in_map.parent_frame for match in accepted} == {uploads[8].room}
     assert both.location.map == "hall"
     off = np.array(both.location.pose.matrix)[:3, 3] - uploads[8].pose[:3, 3]
     assert np.linalg.norm(off) < 0.03

@@ -60,7 +60,7 @@ def fill(uploads):
     def add(engine, which, name="hall"):
         added = [engine.add(uploads[i], name)[0] for i in which]
         assert engine.work_off() == ["succeeded"] * len(which)
-        return [one.frame_id for one in added]
+        return [frame.frame_id for frame in added]
 
     return add
 
@@ -92,7 +92,7 @@ def matches_of(answer):
 
 
 def keys(objects):
-    return sorted(one.key.rpartition("/")[2] for one in objects.list("index/"))
+    return sorted(entry.key.rpartition("/")[2] for entry in objects.list("index/"))
 
 
 def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, uploads, place):
@@ -144,7 +144,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, pl
     objects, secret = open_objects(place), signature(built, built.ids()[0])
 
     def held():
-        stored = (objects.get(one.key) for one in objects.list("index/"))
+        stored = (objects.get(entry.key) for entry in objects.list("index/"))
         files = {name: tmp_path.glob(f"{name}/index/*/*.*") for name in ("one", "two", "three")}
         return {
             *(["store"] if any(secret in data for data in stored) else []),
@@ -186,7 +186,7 @@ def test_nothing_is_shared_of_maps_that_are_gone(built, place, host, uploads):
     folder, objects = folder_of(service), open_objects(place)
     built.delete_map("hall")
     built.purging.now()
-    assert {one.key.split("/")[1] for one in objects.list("index/")} == {".swept"}
+    assert {entry.key.split("/")[1] for entry in objects.list("index/")} == {".swept"}
     service.memory_purging._purged = time.monotonic() - 1
     service.memory_purging.run()
     assert not folder.exists()
@@ -194,7 +194,7 @@ def test_nothing_is_shared_of_maps_that_are_gone(built, place, host, uploads):
 
 def test_what_is_damaged_in_the_store_is_withdrawn_and_built_anew(built, host, uploads, place):
     objects, other = open_objects(place), host("two")
-    (key,) = [one.key for one in objects.list("index/") if one.key.endswith(".faiss")]
+    (key,) = [entry.key for entry in objects.list("index/") if entry.key.endswith(".faiss")]
     data = bytearray(objects.get(key))
     data[-5] ^= 1
     objects.put(key, bytes(data))
@@ -275,7 +275,7 @@ def nodes(make_engine, postgres_url, bucket, tmp_path):
 
 
 def keys_of(objects, prefix):
-    return sorted(one.key for one in objects.list(prefix))
+    return sorted(entry.key for entry in objects.list(prefix))
 
 
 def test_what_one_node_takes_another_works_on(nodes, uploads, bucket):

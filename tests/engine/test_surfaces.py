@@ -303,9 +303,9 @@ def test_a_spot_is_seen_by_the_frames_that_have_a_point_there(engine):
     rest = engine.surfaces.sightings("hall", spot, None, parent.parent_frame, page.next_cursor, 99)
     actual = [*page.items, *rest.items]
     assert (len(page.items), rest.next_cursor) == (2, None)
-    assert [one.frame_id for one in actual] == [name for _, name in sorted(expected)]
+    assert [item.frame_id for item in actual] == [name for _, name in sorted(expected)]
     distances = sorted(one for one, _ in expected)
-    np.testing.assert_allclose([one.distance_m for one in actual], distances, rtol=1e-6)
+    np.testing.assert_allclose([item.distance_m for item in actual], distances, rtol=1e-6)
     nowhere = engine.surfaces.sightings("hall", [1e6, 0.0, 0.0], None, parent.parent_frame)
     assert (nowhere.items, nowhere.next_cursor) == ([], None)
     with pytest.raises(InvalidRequest, match=r"The radius is 4 m. Use a radius above 0 and up to"):

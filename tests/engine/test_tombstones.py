@@ -135,7 +135,7 @@ def test_what_has_come_again_is_not_restored(full, uploads):
         full.tombstones.restore_one("hall", second)
     done = restore(full, deletion)
     assert (done.frames, done.remaining) == (1, 0)
-    reasons = {one.frame_id: one.reason for one in done.refused}
+    reasons = {frame.frame_id: frame.reason for frame in done.refused}
     assert reasons == {first: f"it was uploaded again as frame {again.frame_id}"}
     assert third in frames(full)
     assert full.get_frame("hall", second).name == "other"
@@ -219,7 +219,7 @@ def test_what_could_not_be_signed_is_restored_as_it_was(empty, uploads):
             set_state(connection, actual.number, state, "as a test says")
         frames.append(empty.get_frame("hall", name))
     use = used(empty)
-    deletion = delete(empty, [one.frame_id for one in frames]).deletion
+    deletion = delete(empty, [frame.frame_id for frame in frames]).deletion
     assert deletion.frames == 1
     assert restore(empty, deletion).frames == 1
     now = empty.get_frame("hall", frames[0].frame_id)

@@ -28,7 +28,7 @@ ALL = Query(stages=("retrieve",), k=50)
 def fill(engine, uploads, which):
     added = [engine.add(uploads[i])[0] for i in which]
     assert engine.work_off() == [JobState.SUCCEEDED] * len(which)
-    return [one.frame_id for one in added]
+    return [frame.frame_id for frame in added]
 
 
 def test_an_index_of_a_history_that_was_undone_is_not_believed(make_engine, uploads, tmp_path):

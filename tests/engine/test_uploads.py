@@ -219,7 +219,7 @@ def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(empty, uplo
     tried = {match.frame_id: match.validation for match in answer.matches}
     assert tried[frame_id].free_space_violations is None
     assert tried[image_id].free_space_violations is not None  # the image knows of free space
-    result = {one.frame_id: one.reason for one in answer.explanations or ()}
+    result = {explanation.frame_id: explanation.reason for explanation in answer.explanations or ()}
     assert "violations unknown" in result[frame_id]
     details = empty.inspection.match(answer.query_id, frame_id)
     assert details.query.violations == []

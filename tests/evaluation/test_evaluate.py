@@ -68,7 +68,7 @@ def test_frames_that_cannot_be_used_are_named(building, model_file, figures_of, 
     arguments = (copy, "--db", "0:8:2", "--queries", "1:12:4", "--model", model_file)
     values = figures_of(tmp_path, "evaluate", *arguments)
     assert values["counts"] == {"queries": 2, "database": 3, "left_out": 2}
-    reasons = {one["name"]: one["reason"] for one in values["left_out"]}
+    reasons = {frame["name"]: frame["reason"] for frame in values["left_out"]}
     assert "its pose is unknown" in reasons["room/seq-01/frame-000001"]
     assert "frame-000002" in reasons["room/seq-01/frame-000002"]
     assert "left out" in capsys.readouterr().out

@@ -39,7 +39,7 @@ def main():
         for (operation, fault), trial in trials.items():
             counts.setdefault(operation, {})[fault] = trial.calls
         lines += [f"**{store}**, {time.monotonic() - start:.0f} s:", "", *report(trials), ""]
-        lines += [*(f"* {one}" for one in result), ""] if result else []
+        lines += [*(f"* {item}" for item in result), ""] if result else []
     text = "\n".join(lines)
     sys.stdout.write(json.dumps(counts) if options.json and not broken else f"{text}\n")
     if options.page is not None:

@@ -214,9 +214,9 @@ def violations(store, operation, acknowledged, before):
         gone = before.keys() - _states(engine).keys()
     yield from _remains(store, [part for name in gone for part in before[name]])
     yield from _wrong_bundles(store, operation, said)
-    kinds = Counter(one.kind for one in fsck(store.settings, repair=True, grace_s=0))
+    kinds = Counter(finding.kind for finding in fsck(store.settings, repair=True, grace_s=0))
     yield from (f"fsck: {kind}" for kind in kinds.keys() - _LEFTOVERS)
-    yield from (f"not repaired: {one.what}" for one in fsck(store.settings, grace_s=0))
+    yield from (f"not repaired: {finding.what}" for finding in fsck(store.settings, grace_s=0))
 
 
 def _states(engine):

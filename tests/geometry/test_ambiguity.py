@@ -126,7 +126,7 @@ def test_far_from_equals_the_difference():
 def test_free_space_refutes_no_rival_for_what_it_holds_against_the_transform_too():
     model, overlap_p = read_model("depth"), OverlapParameters()
     poses, seen = zip(*furnished(model, 0, 36), strict=True)
-    views = [plane_view(one, P.planes) for one in seen]
+    views = [plane_view(view, P.planes) for view in seen]
     T = inverse(poses[1]) @ poses[0]
     # slid by 0.3 m each way along each axis: they agree with what lies along it, and violate
     shifts = np.tile(np.eye(4), (6, 1, 1))

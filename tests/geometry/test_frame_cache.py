@@ -54,4 +54,4 @@ def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames):
     del geometry
     gc.collect()
     assert [part() for part in parts] == [None, None, None]
-    assert all(len(one) for one in references)
+    assert all(len(reference) for reference in references)

@@ -203,7 +203,7 @@ def test_a_rival_that_tilts_is_dropped(model):
         pytest.approx(0.82, abs=0.08), pytest.approx(0.53, abs=0.08),
     )  # fmt: skip
     assert level.ambiguity < without.ambiguity - 0.2
-    view = [plane_view(one, AmbiguityParameters().planes) for one in (query, match)]
+    view = [plane_view(frame, AmbiguityParameters().planes) for frame in (query, match)]
     none = np.empty((0, 4, 4))
     result = best_alternative(
         view[0], view[1], np.eye(4), 0.0, without.T_rival[None], none, AmbiguityParameters(),

@@ -88,7 +88,7 @@ def test_refinement_works_on_the_points(lidar):
     fine = lidar.parameters.validation.alignment.fine
     result = refine_transform(a, b, T, fine)
     assert np.linalg.norm(result[:3, 3] - T[:3, 3]) < 0.02
-    plain = [replace(one, surface=replace(one.surface, spread=None)) for one in (a, b)]
+    plain = [replace(shot, surface=replace(shot.surface, spread=None)) for shot in (a, b)]
     coarse = refine_transform(plain[0], plain[1], T, fine)
     off = math.inf if coarse is None else float(np.linalg.norm(coarse[:3, 3] - T[:3, 3]))
     assert np.linalg.norm(result[:3, 3] - T[:3, 3]) < off

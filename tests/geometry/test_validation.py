@@ -312,7 +312,7 @@ def test_sides_of_a_cube_are_not_told_apart(model):
     # nor if each search finds another side: neither refutes what the other one found. A cube on
     # a floor does not fix a transform firmly: all but rivals is to speak for it
     p = ValidationParameters(acceptance=AcceptanceParameters(sparse_deviation_m=1.0))
-    a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in seen)
+    a, b = (frame_samples(view, p.agreement.stride, p.rivals.planes) for view in seen)
     there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
     back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
     assert there is not None

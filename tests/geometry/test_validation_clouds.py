@@ -128,8 +128,8 @@ def test_other_rooms_and_mirror_images_are_rejected(rooms, frame_of):
         assert validate(query.scan, match.scan).status != "accepted"
     _, (query, match) = rooms[0]
     mirrored = frame_of(Cloud(query.points * np.array([1, -1, 1], np.float32)))
-    for one in (query, match):
-        assert validate(mirrored, one.scan).status != "accepted"
+    for frame in (query, match):
+        assert validate(mirrored, frame.scan).status != "accepted"
 
 
 def test_a_depth_image_beside_the_cloud_of_the_same_view(rooms, frame_of):

@@ -96,6 +96,6 @@ def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
     assert engine.get_map("hall").frames == {"indexed": 3}
     assert matches_of(engine, small[3]) == sorted([*ids, other])
     until(lambda: events and (events[-1].kind, events[-1].frame_id) == ("frame.indexed", other))
-    assert [one.kind for one in events].count("events.missed") == 1
+    assert [event.kind for event in events].count("events.missed") == 1
     again = index(engine, small[2])  # as by a robot that keeps its frames for a while
     assert matches_of(engine, small[2]) == sorted([*ids, other, again])

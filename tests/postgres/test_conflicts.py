@@ -61,7 +61,7 @@ def test_a_deadlock_of_two_costs_none_of_those_written_with_them(server_store, r
                     results.append(pool.submit(run, group, work))
                     while len(group._waiting) == before:
                         pass
-        came = [one.result(PATIENCE_S) for one in results]
+        came = [result.result(PATIENCE_S) for result in results]
     assert [came[2], came[5]] == ["done", "done"]
     assert len(tries) > 4  # there was a deadlock, and those of one group were written again
 

@@ -61,10 +61,10 @@ def test_what_cannot_be_numbered_now_comes_later_and_marks_no_state(
         record_event(connection, "late", name)
     with database._engine.begin() as other:  # as a long transaction that told something
         other.exec_driver_sql(f"SELECT pg_advisory_xact_lock({LOCKS}, {EVENTS})")
-        assert [one.kind for one in events_of(server_store)] == ["map.created"] * MAPS
+        assert [event.kind for event in events_of(server_store)] == ["map.created"] * MAPS
         with pytest.raises(StoreLocked):
             anchor_of_now(database, name)
-    assert [one.kind for one in events_of(server_store)][MAPS:] == ["late"]
+    assert [event.kind for event in events_of(server_store)][MAPS:] == ["late"]
 
 
 def test_an_anchor_marks_what_was_pending(server_store, rows):
@@ -96,7 +96,7 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(s
     with pytest.raises(IdempotencyConflict):  # as uploads do then
         writes.run(keep_second)
     assert len(tries) == 2
-    assert "second" not in [one.kind for one in events_of(server_store)]
+    assert "second" not in [event.kind for event in events_of(server_store)]
     with database.read() as connection:
         assert first.stored_result(connection) == {"of": "first"}
 

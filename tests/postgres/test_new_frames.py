@@ -25,9 +25,9 @@ def new(row, content, **fields):
 
 
 def receive(database, *args, wait_s=10.0):
-    with database.write_maps({one.row.number for one in args}, wait_s) as connection:
+    with database.write_maps({argument.row.number for argument in args}, wait_s) as connection:
         ids = receive_frames(connection, args)
-    return [one.frame_id in ids for one in args]
+    return [argument.frame_id in ids for argument in args]
 
 
 def counted(database):
@@ -51,13 +51,13 @@ def test_frames_of_several_maps_are_taken_in_their_order(server_store, rows):
     incoming = [new(c, 5), new(a, 9), new(b, 9, bytes=77), new(a, 1), new(c, 4)]
     assert receive(database, *incoming) == [True] * 5
     assert content_of(database) == [
-        (one.row.number, one.values["content_id"], one.job_id) for one in incoming
+        (frame.row.number, frame.values["content_id"], frame.job_id) for frame in incoming
     ]
     assert counted(database) == [("a", 2, 6), ("b", 1, 77), ("c", 2, 6)]
     with database.read() as connection:
         pending = connection.execute(select(pending_events).order_by(pending_events.c.number))
-        assert [(one.map, one.frame_id, one.job_id) for one in pending] == [
-            (one.row.name, one.frame_id, one.job_id) for one in incoming
+        assert [(event.map, event.frame_id, event.job_id) for event in pending] == [
+            (frame.row.name, frame.frame_id, frame.job_id) for frame in incoming
         ]
 
 
@@ -67,7 +67,7 @@ def test_a_cloud_has_no_intrinsics(server_store, rows):
     assert receive(server_store.database, *incoming) == [True, True]
     with server_store.database.read() as connection:
         query = text("SELECT CAST(intrinsics AS text), pose IS NULL FROM frames ORDER BY number")
-        assert [tuple(one) for one in connection.execute(query)] == [
+        assert [tuple(row) for row in connection.execute(query)] == [
             ('{"width": 1}', True), ("null", True),
         ]  # fmt: skip
 
@@ -95,7 +95,7 @@ def test_a_map_without_room_for_all_takes_none_and_others_take_theirs(
     with database.write() as connection:
         connection.execute(update(maps).where(maps.c.number == a.number).values(**change))
     assert receive(database, new(a, 1), new(b, 1), new(a, 2)) == [taken, True, taken]
-    assert {one[0]: one[1] for one in counted(database)} == {
+    assert {row[0]: row[1] for row in counted(database)} == {
         change.get("name", "a"): 2 * taken, "b": 1, "c": 0,
     }  # fmt: skip
 
@@ -158,12 +158,12 @@ def together(group, incoming, until):
     """What came of frames that all waited for one statement."""
     group._led = True  # somebody writes
     with ThreadPoolExecutor(len(incoming)) as pool:
-        begun = [pool.submit(group.receive, one) for one in incoming]
+        begun = [pool.submit(group.receive, frame) for frame in incoming]
         until(lambda: len(group._waiting) == len(incoming))
         leader = group._waiting[0]
         leader.leads = True
         leader.ready.set()
-        outcomes = [one.exception() or one.result() for one in begun]
+        outcomes = [future.exception() or future.result() for future in begun]
     assert (group._waiting, group._led) == ([], False)
     return outcomes
 
@@ -173,7 +173,7 @@ def test_frames_of_many_threads_are_taken_once(server_store, rows, until, monkey
     monkeypatch.setattr(write_groups, "MOST_TOGETHER", 5)  # two transactions
     incoming = [new(rows[i % 3], i // 2) for i in range(8)] + [new(rows[0], 0)]
     outcomes = together(NewFrames(database), incoming, until)
-    assert sum(outcomes) == sum(one[1] for one in counted(database)) == 8
+    assert sum(outcomes) == sum(row[1] for row in counted(database)) == 8
     with database.read() as connection:
         assert set(connection.execute(select(frames.c.id)).scalars()) == {
             one.frame_id for one, taken in zip(incoming, outcomes, strict=True) if taken
@@ -183,7 +183,7 @@ def test_frames_of_many_threads_are_taken_once(server_store, rows, until, monkey
 def test_one_that_cannot_be_written_sends_all_on_alone(server_store, rows, until):
     incoming = [new(rows[0], 1), new(rows[1], 2, sequence=2**80), new(rows[2], 3)]
     assert together(NewFrames(server_store.database), incoming, until) == [False] * 3
-    assert [one[1] for one in counted(server_store.database)] == [0, 0, 0]
+    assert [row[1] for row in counted(server_store.database)] == [0, 0, 0]
 
 
 def test_a_map_in_use_sends_all_on_alone(server_store, rows, until, monkeypatch):
@@ -200,7 +200,7 @@ def test_a_store_that_cannot_be_used_is_told_to_all(server_store, rows, until, m
     with server_store.database._writers.begin() as other:
         take_turn(other, 10.0)
         outcomes = together(NewFrames(server_store.database), incoming, until)
-    assert [type(one) for one in outcomes] == [StoreLocked, StoreLocked]
+    assert [type(outcome) for outcome in outcomes] == [StoreLocked, StoreLocked]
 
 
 def test_a_statement_that_was_prepared_in_vain_is_prepared_again(server_store, rows):

@@ -155,7 +155,7 @@ def alone(engine, small):
 
 
 def in_a_group(engine, small):
-    result, _ = engine.uploads.add_all("hall", [Upload(*one) for one in small[:2]])
+    result, _ = engine.uploads.add_all("hall", [Upload(*shot) for shot in small[:2]])
     return result
 
 
@@ -314,7 +314,7 @@ def test_what_is_removed_one_by_one_ends_in_time(tmp_path):
     with pytest.raises(StoreAway, match="too slow"):
         objects.delete("missing", "a", "c", seconds=-1.0)
     objects.delete("missing", "a", "c", seconds=60.0)
-    assert [one.key for one in objects.list("")] == []
+    assert [entry.key for entry in objects.list("")] == []
 
 
 def test_blobs_stay_doomed_where_the_object_store_is_away(engine, held, removal, monkeypatch):
@@ -335,7 +335,7 @@ def test_blobs_stay_doomed_where_the_object_store_is_away(engine, held, removal,
 
 def test_another_removal_does_not_hide_that_of_who_was_cut_off(engine, small, held, removal):
     """What it had asked for is carried out later, and not after an upload that is acknowledged."""
-    digest, other = (engine.store.blobs.put(one) for one in (small[0].png, b"of another frame"))
+    digest, other = (engine.store.blobs.put(data) for data in (small[0].png, b"of another frame"))
     removing = removal(digest)
     end_sessions(engine, "objid = 2 AND mode = 'ExclusiveLock'")
     for _ in range(2):
@@ -397,7 +397,7 @@ def test_an_upload_waits_for_a_removal_of_files(small, postgres_url, tmp_path, u
 
 def test_what_is_doomed_again_meanwhile_is_not_settled(engine, held, removal):
     """An upload may have stored the blob again, and died after its frame was deleted."""
-    first, second = (engine.store.blobs.put(one) for one in (b"of another frame", b"of a third"))
+    first, second = (engine.store.blobs.put(data) for data in (b"of another frame", b"of a third"))
     removing = removal(first, second)
     with engine.store.database.write() as connection:
         doom(connection, [first])
@@ -407,7 +407,7 @@ def test_what_is_doomed_again_meanwhile_is_not_settled(engine, held, removal):
 
 
 def test_one_removal_waits_for_another(engine, held, removal, until, waiting, monkeypatch):
-    blobs = [engine.store.blobs.put(one) for one in (b"a", b"b", b"c")]
+    blobs = [engine.store.blobs.put(data) for data in (b"a", b"b", b"c")]
     removing = removal(blobs[0])
     with monkeypatch.context() as patch:
         patch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)

@@ -85,8 +85,8 @@ def rows(store, row):
             connection.execute(select(frames.c.number).where(frames.c.map_number == row.number))
             .scalars()
         )  # fmt: skip
-        of_frames = {one.name: one.c.frame_number.in_(own)
-                     for one in (frame_tags, signatures, surface_frames)}  # fmt: skip
+        of_frames = {table.name: table.c.frame_number.in_(own)
+                     for table in (frame_tags, signatures, surface_frames)}  # fmt: skip
         which = {
             maps.name: maps.c.number == row.number,
             frames.name: frames.c.map_number == row.number,
@@ -100,7 +100,7 @@ def rows(store, row):
 
 def _told(connection, table, of):
     result = connection.execute(select(table).where(of).order_by(*table.primary_key)).mappings()
-    return [{name: one[name] for name in one if name not in CHANCE} for one in result]
+    return [{name: item[name] for name in item if name not in CHANCE} for item in result]
 
 
 def test_a_frame_is_received_as_by_its_parts(server_store, pair):

@@ -47,10 +47,10 @@ def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path
                 writer.image(1.2 + 0.5 * i, IMAGE)
 
     runs = sequences(ros, tmp_path, fill, MOUNTING, container=container)
-    assert [one.name for one in runs] == ["run.part1", "run.part2", "run.part3"]
-    assert [one.parent_frame for one in runs] == [f"run.part{i}/odom" for i in (1, 2, 3)]
+    assert [run.name for run in runs] == ["run.part1", "run.part2", "run.part3"]
+    assert [run.parent_frame for run in runs] == [f"run.part{i}/odom" for i in (1, 2, 3)]
     # the last frame of each run lies after its last sample, and not before those of the next run
-    assert [positions(one) for one in runs] == [
+    assert [positions(run) for run in runs] == [
         [[0.4 + i, 10.0 * run, 0.0] for i in range(last - 1)] for run, last in enumerate((4, 3, 6))
     ]
     assert [frame.name for frame in runs[1].frames] == ["run.part2/000004", "run.part2/000005"]

@@ -41,10 +41,10 @@ def service_url(service_url, room):
     with Client(service_url) as client:
         client.create_map("room", model="depth")
         added = [
-            client.upload("room", one, meta_of(one, session="s", parent_frame="site"))
-            for one in room[::2]
+            client.upload("room", view, meta_of(view, session="s", parent_frame="site"))
+            for view in room[::2]
         ]
-        client.wait([one.job_id for one in added])
+        client.wait([frame.job_id for frame in added])
     return service_url
 
 
@@ -58,11 +58,11 @@ def drive(room, ros):
     def carried(kind="depth", *, later=0.0, frames=FRAMES):
         writer = ros.messages()
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
-        for i, one in enumerate(room[:frames]):
+        for i, view in enumerate(room[:frames]):
             t = later + STEP_S * i
-            k = one.camera.intrinsics
-            T_odom_base = np.linalg.inv(T_MAP_ODOM) @ one.pose @ np.linalg.inv(ros.camera)
-            samples = decode_png(one.read_bytes())
+            k = view.camera.intrinsics
+            T_odom_base = np.linalg.inv(T_MAP_ODOM) @ view.pose @ np.linalg.inv(ros.camera)
+            samples = decode_png(view.read_bytes())
             writer.camera_info(t, k=(k.fx, k.fy, k.cx, k.cy), size=(k.width, k.height))
             send(writer, kind, t, samples, k)  # odometry of the same time follows
             writer.transforms(t, {("odom", "base_link"): T_odom_base})

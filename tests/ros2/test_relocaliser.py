@@ -121,8 +121,8 @@ def test_frames_are_asked_for_no_oftener_than_told(ros):
 def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros):
     writer = still(ros, 1)
     with scripted(interval_s=0.0, wait_s=0.4) as (core, client):
-        for one in writer.written:
-            take(core, *one)
+        for message in writer.written:
+            take(core, *message)
         assert core.step() == 1
         assert core.wait(PATIENCE_S)  # else a later frame may overtake it
         for t in (0.5, 0.7, 0.85):
@@ -243,8 +243,8 @@ def test_odometry_of_its_own_topic_serves_where_tf_has_none(ros):
     writer.odometry(0.0, ros.transform(1, 0, 0))
     writer.image(0.0, np.full((6, 8), 1000))
     with scripted() as (core, _):
-        for one in writer.written:
-            take(core, *one)
+        for message in writer.written:
+            take(core, *message)
         assert core.step() == 1
         assert core.wait(PATIENCE_S)
         report = core.report(ros.start * SECOND)
@@ -253,8 +253,8 @@ def test_odometry_of_its_own_topic_serves_where_tf_has_none(ros):
         writer.transforms(1.0, {("odom", "base_link"): ros.transform(2, 0, 0)})
         writer.odometry(2.0, ros.transform(9, 0, 0))
         writer.image(2.0, np.full((6, 8), 1000))
-        for one in writer.written[-3:]:
-            take(core, *one)
+        for message in writer.written[-3:]:
+            take(core, *message)
         assert core.step() == 0
 
 

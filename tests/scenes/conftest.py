@@ -64,9 +64,9 @@ def drawn_at(rows, topic):
     for row in rows:
         if row.path == topic and UPDATE in row.values:
             [update] = row.values[UPDATE]
-            for one in update["deletions"] or ():
-                del drawn[one["id"]]
-            drawn |= {one["id"]: one for one in update["entities"] or ()}
+            for entity in update["deletions"] or ():
+                del drawn[entity["id"]]
+            drawn |= {entity["id"]: entity for entity in update["entities"] or ()}
     return drawn
 
 

@@ -92,5 +92,5 @@ def test_a_moment_takes_the_place_of_the_one_before():
     a, b = (SceneEntity((name,), TextPage(name)) for name in "ab")
     for moment in (Moment([a]), Moment([a, b], 0), Moment([]), Moment([b], 1), Moment([], 2)):
         stream.write(moment)
-    assert [[one.path for one in gone] for gone in writer.gone] == [[], [], [], [("a",)], [("b",)]]
+    assert [[row.path for row in gone] for gone in writer.gone] == [[], [], [], [("a",)], [("b",)]]
     assert not stream.is_empty

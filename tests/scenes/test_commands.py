@@ -61,13 +61,13 @@ def test_the_frames_of_a_map_are_shown(sceneprint, client, tmp_path):
 def halves(client, walk):
     """The walk as two sessions in parent frames of their own, one of which is moved by 10 m."""
     client.create_map("halves")
-    for i, one in enumerate(walk):
+    for i, view in enumerate(walk):
         name = ("even", "odd")[i % 2]
-        pose = one.pose.copy()
+        pose = view.pose.copy()
         pose[0, 3] += 10.0 * (i % 2)
-        meta = meta_of(one, session=name, with_pose=False).model_dump()
+        meta = meta_of(view, session=name, with_pose=False).model_dump()
         meta |= {"pose": {"matrix": pose.tolist(), "parent_frame": name}}
-        client.upload("halves", one, FrameMeta.model_validate(meta))
+        client.upload("halves", view, FrameMeta.model_validate(meta))
     client.wait([frame.job_id for frame in client.frames("halves")], timeout_s=PATIENCE_S)
     yield
     client.delete_map("halves")

@@ -37,8 +37,8 @@ class Recorder:
         assert answer.is_success, (name, answer.text)
         lines = self._client.get("/v1/audit", params={"limit": 1000}).json()["items"]
         result = [line for line in reversed(lines) if line["request_id"] == request_id]
-        assert [one["action"] for one in result] == wanted, name
-        assert {one["address"] for one in result} <= {"127.0.0.1"}
+        assert [item["action"] for item in result] == wanted, name
+        assert {item["address"] for item in result} <= {"127.0.0.1"}
         self.tried.add(name)
         return answer
 

@@ -85,8 +85,8 @@ def opened(monkeypatch, request, certificate):
         try:
             yield connect
         finally:
-            for one in wires:
-                one.close()
+            for wire in wires:
+                wire.close()
 
 
 by_tls = pytest.mark.parametrize("opened", ["https"], indirect=True)

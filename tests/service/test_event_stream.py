@@ -84,7 +84,7 @@ def test_what_is_gone_is_said_to_be(database):
         for after, place in ((1, 1), (99, 12)):
             stream = feed.batches(EventFilter(), after, always)
             first, position = await anext(stream)
-            assert [(one.number, one.kind) for one in first] == [(place, "events.missed")]
+            assert [(row.number, row.kind) for row in first] == [(place, "events.missed")]
             assert position == place
             if place < 12:
                 assert await gather(stream, 10) == [2, *range(4, 13)]

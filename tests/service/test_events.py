@@ -77,7 +77,7 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
         assert (first["kind"], first["map"], first["frame_id"]) == ("map.created", "told", None)
         sent = client.post(f"{path}/frames", **small_shots[0].form()).json()
         result = [next_event(came) for _ in range(2)]
-    assert [(one["kind"], one["frame_id"], one["job_id"]) for one in result] == [
+    assert [(item["kind"], item["frame_id"], item["job_id"]) for item in result] == [
         ("frame.received", sent["frame_id"], sent["job_id"]),
         ("frame.indexed", sent["frame_id"], sent["job_id"]),
     ]

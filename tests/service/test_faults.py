@@ -51,7 +51,7 @@ def test_what_nobody_thought_of_is_told_by_its_id_alone(shaken, refused, truth):
     (noted,) = shaken.log("unexpected error")
     assert noted["request_id"] == "unheard-of"
     assert "Traceback" in noted["traceback"]
-    (line,) = [one for one in shaken.log("request") if one["request_id"] == "unheard-of"]
+    (line,) = [line for line in shaken.log("request") if line["request_id"] == "unheard-of"]
     assert (line["status"], line["method"], line["path"]) == (500, "GET", "/v1/maps")
     counted = 'sceneprint_requests_total{method="GET",route="/v1/maps",status="500"} 1.0'
     assert counted in shaken.client.get("/metrics").text

@@ -104,12 +104,12 @@ def test_another_process_that_keeps_writing_stops_uploads_alone(busy, small_shot
         allow(writing, 0)
         with ThreadPoolExecutor(4) as pool:
             sent = [pool.submit(upload, i) for i in (8, 9, 10, 11)]
-            until(lambda: any(one.done() for one in sent))
+            until(lambda: any(future.done() for future in sent))
             query = busy.client.post(f"{path}/queries", **small_shots[0].form())
             assert (query.status_code, query.json()["status"]) == (200, "found")
             for address in ("/healthz", "/readyz", "/metrics", path, f"{path}/frames"):
                 assert busy.client.get(address).status_code == 200
-            answers = [one.result() for one in sent]
+            answers = [future.result() for future in sent]
             for answer in answers:
                 assert (answer.status_code, answer.headers["retry-after"]) == (503, "1")
             kinds = [answer.json()["type"].rpartition("/")[2] for answer in answers]

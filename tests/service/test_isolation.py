@@ -169,7 +169,7 @@ def there(walled, small_shots, until):
             ).json()
             for number, shot in enumerate(some)
         ]  # fmt: skip
-        assert [one["state"] for one in sent] == ["indexed"] * 3
+        assert [row["state"] for row in sent] == ["indexed"] * 3
         frame = sent[0]["frame_id"]
         answer = walled.ask("boss", "POST", f"/v1/maps/{name}/queries", json={"frame_id": frame})
         query = answer.json()["query_id"]
@@ -362,9 +362,9 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
         walled.ask("admin", "POST", "/v1/queries", json={"maps": [OWN], "query_id": one})
         for one in (mixed, "0" * 32)
     ]
-    assert [one.json()["detail"].replace(mixed, "0" * 32) for one in again] \
+    assert [answer.json()["detail"].replace(mixed, "0" * 32) for answer in again] \
         == [again[1].json()["detail"]] * 2  # fmt: skip
-    assert [one.status_code for one in again] == [404, 404]
+    assert [answer.status_code for answer in again] == [404, 404]
     record = walled.ask("boss", "PUT", f"/v1/queries/{mixed}/keep", json={"title": "secret"})
     assert record.status_code == 200
     for method in ("PUT", "DELETE"):

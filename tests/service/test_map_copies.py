@@ -18,7 +18,7 @@ def test_a_reader_copies_what_is_indexed_and_nothing_else(house, small_shots, re
         house.ask("boss", "POST", f"{ALPHA}/frames", **shot.form(tags=["b", "a"]))
         for shot in small_shots[:3]
     ]
-    ids = [one.json()["frame_id"] for one in sent]
+    ids = [answer.json()["frame_id"] for answer in sent]
     house.work()
     house.ask("boss", "DELETE", f"{ALPHA}/frames/{ids[2]}")
     house.ask("boss", "POST", f"{ALPHA}/frames", **small_shots[3].form())

@@ -22,7 +22,7 @@ def test_who_comes_too_many_is_sent_away_and_may_come_back(busy, shots, refused)
     with ThreadPoolExecutor(13) as pool:
         futures = [pool.submit(ask, i) for i in range(12)]
         health = pool.submit(busy.client.get, "/healthz")
-        answers = [one.result() for one in futures]
+        answers = [future.result() for future in futures]
         assert health.result().json()["status"] == "ok"
     kinds = sorted(answer.status_code for answer in answers)
     assert set(kinds) == {200, 503}

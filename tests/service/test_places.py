@@ -107,10 +107,10 @@ def test_bodies_that_are_still_read_take_places_among_their_like(inside, kind, o
         # uploads mostly wait for the disk, and more of them are in hand at once
         places = 2 + (UPLOADS if kind == "frames" else 1)
         slow = [Asked(app, path, FORM, [HEAD, END]) for _ in range(places)]
-        for one in slow:
-            one.more.clear()
+        for request in slow:
+            request.more.clear()
         for _ in range(3000):  # half a minute
-            if sum(one.read for one in slow) == 2 * places:
+            if sum(request.read for request in slow) == 2 * places:
                 break
             await asyncio.sleep(0.01)
         assert [(one.read, one.status, one.body) for one in slow] == [(2, 0, b"")] * places
@@ -123,9 +123,9 @@ def test_bodies_that_are_still_read_take_places_among_their_like(inside, kind, o
         problem = await by_id.problem()
         busy = kind == "queries"
         assert (problem["status"], by_id.read > 0) == (503 if busy else 404, not busy)
-        for one in slow:
-            one.more.set()
-            assert (await one.problem())["detail"].startswith("The form has no field `meta`.")
+        for request in slow:
+            request.more.set()
+            assert (await request.problem())["detail"].startswith("The form has no field `meta`.")
         for _ in range(4):  # all places are free again
             after = Asked(app, "/v1/maps/a/queries", JSON, [b'{"frame_id": "a"}'])
             assert (await after.problem())["type"] == "/problems/unknown-map"
@@ -159,4 +159,4 @@ def test_where_there_is_no_room_to_read_nothing_is_taken(
 
     inside(test, concurrent_requests=1, queued_requests=0)
     records = [record for record in caplog.records if record.message == "request failed"]
-    assert ["no room in /the/folder" in str(vars(one)["error"]) for one in records] == [True] * 3
+    assert ["no room in /the/folder" in str(vars(r)["error"]) for r in records] == [True] * 3

@@ -24,9 +24,9 @@ def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):
     for name, key in (("alpha", "robot"), ("bravo", "other"), ("alpha", "boss")):
         response = house.ask(key, "POST", f"/v1/maps/{name}/queries", **shot.form())
         assert response.status_code == 200, response.text
-    both = [(one["map"], one["key"]) for one in listed(house, "both")]
+    both = [(row["map"], row["key"]) for row in listed(house, "both")]
     assert both == [("alpha", "boss"), ("bravo", "other"), ("alpha", "robot")]
-    assert [one["map"] for one in listed(house, "robot")] == ["alpha", "alpha"]
+    assert [row["map"] for row in listed(house, "robot")] == ["alpha", "alpha"]
     refused(house.ask("robot", "GET", "/v1/queries", params={"map": "bravo"}), 404, "unknown-map")
     refused(house.ask("boss", "GET", "/v1/queries", params={"map": "cellar"}), 404, "unknown-map")
     for wrong in ({"status": "fine"}, {"since": "2026-11-23T10:00:00"}, {"cursor": "x"}):
@@ -55,7 +55,7 @@ def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):
     delete = {"params": {"map": "alpha"}}
     refused(house.ask("robot", "DELETE", "/v1/queries", **delete), 403, "forbidden")
     assert house.ask("boss", "DELETE", "/v1/queries", **delete).status_code == 204
-    assert [one["map"] for one in listed(house, "boss")] == ["bravo"]
+    assert [row["map"] for row in listed(house, "boss")] == ["bravo"]
     answer = f"/v1/queries/{listed(house, 'boss')[0]['query_id']}"
     assert house.ask("other", "GET", answer).status_code == 200
     assert house.ask("boss", "DELETE", "/v1/maps/bravo").status_code == 204

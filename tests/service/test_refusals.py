@@ -57,7 +57,7 @@ def test_metadata_that_cannot_be_is_refused(served, hall, small_shots, refused, 
     for route in ("frames", "queries"):
         answer = served.client.post(f"{hall}/{route}", **small_shots[0].form(**other))
         problem = refused(answer, 422, kind, text)
-        assert [one["field"] for one in problem.get("errors", [])] == fields
+        assert [error["field"] for error in problem.get("errors", [])] == fields
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_a_camera_that_is_none_is_refused(served, hall, small_shots, refused, fi
     )
     form["data"]["meta"] = f'{{"intrinsics": {{{camera}}}}}'
     problem = refused(served.client.post(f"{hall}/frames", **form), 422, kind)
-    fields = [one["field"] for one in problem.get("errors", [])]
+    fields = [error["field"] for error in problem.get("errors", [])]
     assert fields == ([f"intrinsics.{field}"] if kind == "invalid-request" else [])
 
 

@@ -33,7 +33,7 @@ def test_a_quota_is_the_operators(house, refused):
     created = house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "depth"})
     assert (created.status_code, created.json()["quota_frames"]) == (201, 10)
     audited = house.ask("boss", "GET", "/v1/audit").json()["items"]
-    [change] = [one for one in audited if one["action"] == "map.edited"]
+    [change] = [line for line in audited if line["action"] == "map.edited"]
     assert (change["actor"], change["map"]) == ("boss", "alpha")
     assert change["data"] == {
         "fields": ["quota_bytes", "quota_frames"], "quota_bytes": 10**9, "quota_frames": 10
@@ -45,7 +45,7 @@ def test_beyond_the_quota_nothing_is_taken(house, refused, small_shots):
     house.ask("boss", "PATCH", "/v1/maps/alpha", json={"quota_frames": 2})
     assert house.ask("robot", "POST", path, **a.form()).status_code == 202
     batch = {
-        "files": [("frame", ("f.png", one.png, "image/png")) for one in (a, b, c)],
+        "files": [("frame", ("f.png", shot.png, "image/png")) for shot in (a, b, c)],
         "data": {"metas": json.dumps({"intrinsics": a.camera})},
     }
     items = house.ask("robot", "POST", f"{path}/batch", **batch).json()["items"]

@@ -73,7 +73,7 @@ def test_keys_of_a_tenant_share_its_streams_and_leave_some_to_others(shared, unt
 
 def test_keys_tell_their_tenant(shared, refused):
     listed = shared.ask("victim", "GET", "/v1/keys").json()["items"]
-    assert {one["name"]: one["tenant"] for one in listed} == {
+    assert {row["name"]: row["tenant"] for row in listed} == {
         "victim": "victim", "one": "noisy", "two": "noisy",
     }  # fmt: skip
     new = {"name": "three", "grants": {"*": "read"}, "tenant": "nobody"}
@@ -250,7 +250,7 @@ def test_metrics_tell_tenants_apart(shared, until):
     def series(name):
         result = shared.ask("victim", "GET", "/metrics").text
         pattern = rf"^sceneprint_tenant_{name}{{(.*)}} (.*)$"
-        return {one[0]: float(one[1]) for one in re.findall(pattern, result, re.MULTILINE)}
+        return {text[0]: float(text[1]) for text in re.findall(pattern, result, re.MULTILINE)}
 
     seen = series("requests_total")
     assert seen['status="404",tenant="noisy"'] >= 1

@@ -128,7 +128,7 @@ def plain(texts):
     def number(match):
         return f"<{numbers.setdefault(match[0], len(numbers))}>"
 
-    return [TOOK.sub("<took>", TIMES.sub("<time>", CHANCE.sub(number, one))) for one in texts]
+    return [TOOK.sub("<took>", TIMES.sub("<time>", CHANCE.sub(number, text))) for text in texts]
 
 
 @pytest.mark.thorough

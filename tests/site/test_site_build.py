@@ -32,9 +32,9 @@ def site(tmp_path_factory):
 def test_nothing_is_loaded_from_another_host(site):
     pages = [path.read_text() for path in site.rglob("*.html")]
     tags = [tag for page in pages for tag in re.findall(r"<[^>]+>", page)]
-    loaded = [one for tag in tags for one in re.findall(r'\bsrc="([^"]*)"', tag)]
+    loaded = [text for tag in tags for text in re.findall(r'\bsrc="([^"]*)"', tag)]
     links = [tag for tag in tags if tag.startswith("<link") and 'rel="canonical"' not in tag]
-    loaded += [one for tag in links for one in re.findall(r'\bhref="([^"]*)"', tag)]
+    loaded += [text for tag in links for text in re.findall(r'\bhref="([^"]*)"', tag)]
     assert len(loaded) > len(pages) > 10
     assert {url for url in loaded if urlsplit(url).netloc} == set()
     styles = "".join(path.read_text() for path in site.rglob("*.css"))

@@ -70,7 +70,7 @@ def test_a_line_names_what_was_changed(store):
         record_event(connection, "key.created", name="screen")
         record_event(connection, "frame.damaged", "hall", "f2")  # was found, and not changed
         record_change(connection, "job.cancelled", "hall", "j2", kind="sign")
-    result = [(one.action, one.map, one.target, one.data) for one in lines_of(store)]
+    result = [(line.action, line.map, line.target, line.data) for line in lines_of(store)]
     assert result == [
         ("frame.edited", "hall", "f1", {"fields": ["tags"]}),
         ("key.created", None, "screen", {"name": "screen"}),
@@ -108,7 +108,7 @@ def test_lines_are_found_by_actor_map_action_and_time(store):
         ({"actor": "boss"}, [1]), ({"map": "hall"}, [2]), ({"action": "key."}, [1]),
         ({"since": 5.0}, [3]), ({"actor": "robot", "action": "map.edited"}, [2]), ({}, [1, 2, 3]),
     ):  # fmt: skip
-        assert [one.number for one in lines_of(store, **wanted)] == numbers
+        assert [line.number for line in lines_of(store, **wanted)] == numbers
 
 
 def test_pages_go_from_the_newest_to_the_oldest(store, monkeypatch):
@@ -129,10 +129,10 @@ def test_old_lines_are_removed(store):
     log = Audit(store, days=2.0)
     assert log.tidy(now=DAY_S * 4.5) == 2  # the last stays behind a younger one
     assert log.tidy(now=DAY_S * 99) == 0  # not before an hour is over
-    assert [one.at for one in lines_of(store)] == [DAY_S * 9, DAY_S * 3]
+    assert [line.at for line in lines_of(store)] == [DAY_S * 9, DAY_S * 3]
     assert Audit(store, days=2.0).tidy(now=DAY_S * 99) == 2
     add_lines(store, {})
-    assert [one.number for one in lines_of(store)] == [5]  # a number is never given again
+    assert [line.number for line in lines_of(store)] == [5]  # a number is never given again
 
 
 def test_the_newest_lines_of_each_tenant_are_kept(store):
@@ -147,4 +147,4 @@ def test_the_newest_lines_of_each_tenant_are_kept(store):
         assert surplus_lines(connection, 0.0, 2, most_lines=4) == [3, 4]  # the oldest first
         spent = surplus_lines(connection, 0.0, 99, most_lines=4)
         remove_lines(connection, spent)
-    assert [one.number for one in lines_of(store)] == [1, 2, 8, 9, 10, 11]
+    assert [line.number for line in lines_of(store)] == [1, 2, 8, 9, 10, 11]

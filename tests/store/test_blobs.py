@@ -51,7 +51,7 @@ def bucket(request, tmp_path):
     locks = FileLocks(tmp_path / "lock", make=True)
     return Kept(
         ObjectBlobs(objects, locks, lambda: "me"),
-        lambda: sorted(one.key for one in objects.list("") if one.key != MARK),
+        lambda: sorted(entry.key for entry in objects.list("") if entry.key != MARK),
         objects.put,
     )
 
@@ -193,9 +193,9 @@ def test_a_blob_may_be_put_and_removed_at_once(blobs, tmp_path):
 
     with ThreadPoolExecutor(2) as pool:
         putting = [pool.submit(put) for _ in range(2)]
-        while not all(one.done() for one in putting):
+        while not all(future.done() for future in putting):
             blobs.remove(DIGEST)
-    assert [one.result() for one in putting] == [None, None]
+    assert [future.result() for future in putting] == [None, None]
     assert not [name for name in files(tmp_path) if name.endswith(".part")]
 
 

@@ -132,7 +132,7 @@ def test_every_list_is_that_of_plain_python(store, hall, mixed):
     with store.database.read() as connection:
         for wanted in [*sessions, *(some_listing(rng) for _ in range(110))]:
             limit = int(rng.integers(1, 9))
-            expected = [one for one in mixed if passes(one, wanted)]
+            expected = [row for row in mixed if passes(row, wanted)]
             if wanted.order == "desc":
                 expected.reverse()
             elif wanted.order == "taken":
@@ -151,9 +151,9 @@ def test_every_list_is_that_of_plain_python(store, hall, mixed):
 
 def test_sessions_are_those_of_plain_python(store, hall, mixed):
     expected = {}
-    for one in mixed:
-        if one.state != "deleted":
-            expected.setdefault((one.session or "", one.robot or ""), []).append(one)
+    for row in mixed:
+        if row.state != "deleted":
+            expected.setdefault((row.session or "", row.robot or ""), []).append(row)
     with store.database.read() as connection:
         runs = list_runs(connection, hall.number, None, 99)
         paged, after = [], None
@@ -164,19 +164,19 @@ def test_sessions_are_those_of_plain_python(store, hall, mixed):
     assert [(run.session or "", run.robot or "") for run in runs] == sorted(expected)
     for run in runs:
         own = expected[run.session or "", run.robot or ""]
-        times = [one.captured_at for one in own if one.captured_at is not None]
-        assert run.states == Counter(one.state for one in own)
-        assert run.posed == sum(one.pose is not None for one in own)
+        times = [row.captured_at for row in own if row.captured_at is not None]
+        assert run.states == Counter(row.state for row in own)
+        assert run.posed == sum(row.pose is not None for row in own)
         assert (run.first, run.last) == (min(times, default=None), max(times, default=None))
         assert run.parents == Counter(o.pose_parent for o in own if o.pose_parent is not None)
 
 
 def stamped(own, run, stamp):
     """Ids, stamps and poses of frames in order of their stamps; of equal stamps, the first."""
-    posed = [one for one in own if one.pose_parent == run.parent_frame and stamp(one) is not None]
+    posed = [row for row in own if row.pose_parent == run.parent_frame and stamp(row) is not None]
     posed.sort(key=lambda one: (stamp(one), taken(one)), reverse=True)
-    first = list({stamp(one): one for one in posed}.values())[::-1]
-    return [(one.id, stamp(one), one.pose) for one in first]
+    first = list({stamp(row): row for row in posed}.values())[::-1]
+    return [(row.id, stamp(row), row.pose) for row in first]
 
 
 def test_poses_of_a_run_are_those_of_plain_python(store, hall, mixed):
@@ -189,12 +189,12 @@ def test_poses_of_a_run_are_those_of_plain_python(store, hall, mixed):
     ):
         between = {"captured_after": run.captured_after, "captured_before": run.captured_before}
         own = [
-            one
-            for one in mixed
-            if one.session == run.session
-            and one.state != "deleted"
-            and run.robot in (None, one.robot)
-            and passes(one, FrameListing(**between))
+            row
+            for row in mixed
+            if row.session == run.session
+            and row.state != "deleted"
+            and run.robot in (None, row.robot)
+            and passes(row, FrameListing(**between))
         ]
         captured = stamped(own, run, lambda one: one.captured_at)
         assert captured
@@ -206,7 +206,7 @@ def test_poses_of_a_run_are_those_of_plain_python(store, hall, mixed):
         assert result == (captured, len(captured))
         assert placed == stamped(own, run, lambda one: one.sequence)
         assert {(robot, parent): count for robot, parent, count in counted} == Counter(
-            (one.robot, one.pose_parent) for one in own
+            (row.robot, row.pose_parent) for row in own
         )
 
 

@@ -81,14 +81,14 @@ def test_the_database_and_the_stream_pick_the_same(store):
     kinds = ((), ("frame.",), ("frame.i", "key."), ("frame_",), ("map.created",))
     with store.database.read() as connection:
         every = list_events(connection, EventFilter())
-        assert [one.number for one in every] == list(range(1, 63))
+        assert [event.number for event in every] == list(range(1, 63))
         for named, begun, of_maps in itertools.product(maps, kinds, (False, True)):
             wanted = EventFilter(named, begun, of_maps)
-            assert list_events(connection, wanted) == [one for one in every if wanted(one)]
-            seen = [one.number for one in every if wanted.sees(one)]
+            assert list_events(connection, wanted) == [event for event in every if wanted(event)]
+            seen = [event.number for event in every if wanted.sees(event)]
             assert newest_selected(connection, wanted) == max(seen, default=0)
         newest = list_events(connection, EventFilter(), before=50, limit=7, newest_first=True)
-        assert [one.number for one in newest] == list(range(49, 42, -1))
+        assert [event.number for event in newest] == list(range(49, 42, -1))
 
 
 def test_events_are_counted_by_interval(store):
@@ -102,9 +102,9 @@ def test_events_are_counted_by_interval(store):
         ):
             counted = count_events(connection, KEPT, start, width, name)
             naive = {}
-            for one in every:
-                if one.at >= start and name in (None, one.map):
-                    place = (int((one.at - start) // width), one.kind)
+            for event in every:
+                if event.at >= start and name in (None, event.map):
+                    place = (int((event.at - start) // width), event.kind)
                     naive[place] = naive.get(place, 0) + 1
             recent = {key: n for key, n in counted.items() if key[0] < 1e6}  # not of the maps
             assert recent == naive

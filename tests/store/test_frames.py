@@ -119,12 +119,12 @@ def test_a_damaged_signature_is_noticed_and_deleting_its_frame_helps(
             update(signatures).where(signatures.c.frame_number == bad.number).values(vector=b"\0")
         )
     (block,) = changes(store, hall, 0)
-    assert [(one.frame_id, one.vector is None, one.deleted) for one in block] == [
+    assert [(change.frame_id, change.vector is None, change.deleted) for change in block] == [
         (good.id, False, False), (bad.id, True, False),
     ]  # fmt: skip
     delete(store, hall, bad)
     (block,) = changes(store, hall, 0)
-    assert [(one.number, one.deleted) for one in block] == [
+    assert [(change.number, change.deleted) for change in block] == [
         (good.number, False), (bad.number, True),
     ]  # fmt: skip
 

@@ -23,21 +23,21 @@ def test_a_secret_ends_with_its_overlap_and_the_next_goes_on(store, clock):
     with store.database.write() as connection:
         first = keys.create_key(connection, "robot", {"hall": "write"}, 1_000_900.0)
         second = keys.rotate_key(connection, "robot", 100)
-        ends = [keys.find_key(connection, one).expires_at for one in (first, second)]
+        ends = [keys.find_key(connection, secret).expires_at for secret in (first, second)]
         assert ends == [1_000_100.0, 1_000_900.0]  # of the old secret, when it does
         clock[0] += 99
         third = keys.rotate_key(connection, "robot", 500)  # the first keeps its end
-        rows = [keys.find_key(connection, one) for one in (first, second, third)]
-        assert [one and one.grants for one in rows] == [{"hall": "write"}, None, {"hall": "write"}]
+        rows = [keys.find_key(connection, secret) for secret in (first, second, third)]
+        assert [row and row.grants for row in rows] == [{"hall": "write"}, None, {"hall": "write"}]
         clock[0] += 1
         assert keys.find_key(connection, first) is None
         fourth = keys.rotate_key(connection, "robot", 5000)  # a key ends with its own end
-        ends = [keys.find_key(connection, one).expires_at for one in (third, fourth)]
+        ends = [keys.find_key(connection, secret).expires_at for secret in (third, fourth)]
         assert ends == [1_000_900.0, 1_000_900.0]
         with pytest.raises(UnknownKey, match="'cart'"):
             keys.rotate_key(connection, "cart", 1)
         keys.revoke_key(connection, "robot")
-        assert [keys.find_key(connection, one) for one in (third, fourth)] == [None, None]
+        assert [keys.find_key(connection, secret) for secret in (third, fourth)] == [None, None]
 
 
 def test_a_use_is_written_once_an_hour(store, clock):
@@ -79,7 +79,7 @@ def test_a_key_is_shown_once_and_kept_as_a_hash(store):
     with store.database.read() as connection:
         assert [key.name for key in keys.list_keys(connection)] == ["dashboard", "fleet"]
         key_rows = [keys.find_key(connection, s) for s in (secret, other, secret[:-1], "")]
-        assert [one and (one.name, one.grants, one.expires_at) for one in key_rows] == [
+        assert [k and (k.name, k.grants, k.expires_at) for k in key_rows] == [
             ("fleet", {"*": "admin"}, None), ("dashboard", {"hall": "read"}, 5.0), None, None,
         ]  # fmt: skip
         rows = connection.execute(select(table).order_by(table.c.name.desc())).all()

@@ -41,8 +41,8 @@ def test_keys_are_put_listed_and_removed(kind, request, tmp_path):
     assert objects.get("a/1") == b"one"
     objects.put("a/1", b"three")
     objects.put("b", b"")
-    assert sorted((one.key, one.size) for one in objects.list("")) == [("a/1", 5), ("b", 0)]
-    assert [one.key for one in objects.list("a/")] == ["a/1"]
+    assert sorted((entry.key, entry.size) for entry in objects.list("")) == [("a/1", 5), ("b", 0)]
+    assert [entry.key for entry in objects.list("a/")] == ["a/1"]
     assert (objects.get("b"), objects.open("b").read(), [*objects.chunks("b")]) == (b"", b"", [])
     large = os.urandom(2 * PART + 7)
     file = io.BytesIO(b"skipped" + large)
@@ -106,7 +106,7 @@ def test_a_server_that_falls_acknowledges_nothing(brittle, monkeypatch):
             objects.get("a")
         object_client.time.sleep(0.02)  # leaves the processor to others
     assert objects.put("a", b"x")
-    assert [one.key for one in objects.list("")] == ["a"]
+    assert [entry.key for entry in objects.list("")] == ["a"]
 
 
 def test_a_server_that_never_answers_is_given_up(monkeypatch, bucket):

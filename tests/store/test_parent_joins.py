@@ -105,8 +105,8 @@ def test_what_was_moved_is_noted_for_surfaces(at):
     join_chain(connection, number)
     numbers = list(connection.execute(select(frames.c.number).order_by(frames.c.number)).scalars())
     rows = [
-        {"map_number": number, "frame_number": one, "parent": "A", "changed": False}
-        for one in numbers
+        {"map_number": number, "frame_number": frame_number, "parent": "A", "changed": False}
+        for frame_number in numbers
     ]
     connection.execute(insert(surface_frames), rows)
     undo_joins(connection, number, BA)

@@ -149,11 +149,11 @@ def test_a_claim_is_looked_up_and_not_sorted(store, hall, plans):
     queue_jobs(store, hall, "many", 50)
     with store.database.write() as connection, plans(connection) as said:
         assert queue.claim(connection, "w", 60) is not None
-    of_jobs = [one for one in said if "jobs" in one and one.startswith(("SEARCH", "SCAN"))]
+    of_jobs = [text for text in said if "jobs" in text and text.startswith(("SEARCH", "SCAN"))]
     assert len(of_jobs) >= 8  # names, the next, best and turn of each; first; silent, turn; last
     indexes = ("INDEX ix_jobs_", "INTEGER PRIMARY KEY")
     assert all(line.startswith("SEARCH") and any(i in line for i in indexes) for line in of_jobs)
-    assert not any("TEMP B-TREE" in one for one in said)
+    assert not any("TEMP B-TREE" in text for text in said)
 
 
 # Tenants take turns.

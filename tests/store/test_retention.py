@@ -72,7 +72,7 @@ def test_what_happens_elsewhere_moves_nothing(filled):
         gone = surplus_events(connection, 10, (), 9999)
         shop_numbers = numbers_of(connection, "shop")
         shops = [shop for shop in shop_numbers if shop < own]
-        assert [one for one in gone if one in shop_numbers] == shops
+        assert [row for row in gone if row in shop_numbers] == shops
         assert removal_floor(connection, EventFilter(), 10, 0) > own
 
 

@@ -107,8 +107,8 @@ def test_a_writer_holds_what_it_has_read(store, hall):
                 connection.execute(update(maps).values(revision=seen + 1))
 
     with ThreadPoolExecutor(3) as pool:
-        for one in [pool.submit(count) for _ in range(3)]:
-            one.result()
+        for future in [pool.submit(count) for _ in range(3)]:
+            future.result()
     with store.database.read() as connection:
         assert find_map(connection, "hall").revision == 120
 

@@ -34,7 +34,7 @@ def together(database, works, *, one_by_one=False):
                 if one_by_one:
                     until_waiting(group, len(begun))
             until_waiting(group, len(works))
-        outcomes = [one.exception() or one.result() for one in begun]
+        outcomes = [future.exception() or future.result() for future in begun]
     return outcomes, commits[0] - 1
 
 
@@ -106,7 +106,7 @@ def test_a_full_disk_is_told_to_all(database):
         raise StoreFull("no room")
 
     outcomes, _ = together(database, [noting("a", 0), full])
-    assert [type(one) for one in outcomes] == [StoreFull, StoreFull]
+    assert [type(outcome) for outcome in outcomes] == [StoreFull, StoreFull]
     assert (count(database, "a"), count(database, "full")) == (0, 0)
 
 

@@ -15,7 +15,7 @@ def test_two_workers_sign_each_frame_once(crew, frames):
         assert len(added) < 40
         added += [crew.engine.add_frame("many", *f)[0] for f in frames[len(added) : len(added) + 8]]
         crew.settled("many", len(added))
-    jobs = [crew.engine.get_job(one.job_id) for one in added]
+    jobs = [crew.engine.get_job(frame.job_id) for frame in added]
     assert {(job.state, job.error) for job in jobs} == {("succeeded", None)}
     assert {job.attempts for job in jobs} == {1}
     assert crew.signed("many") == [1] * len(added)
@@ -48,7 +48,7 @@ def test_a_job_that_takes_many_leases_is_kept_by_its_worker(crew, slow):
     assert crew.job(job_id, "state, attempts, token") == ("succeeded", 1, 1)
     assert crew.pid(job_id) == holder
     assert crew.signed("patient") == [1]
-    assert [one for one in crew.log("lease lost") if one["job_id"] == job_id] == []
+    assert [line for line in crew.log("lease lost") if line["job_id"] == job_id] == []
 
 
 def test_told_to_stop_workers_give_back_what_they_have_not_begun(crew, frames):

@@ -243,7 +243,7 @@ def _order_layers(graph: LayeredGraph) -> list[list[Node]]:
 
 def _sort(layer: list[Node], before: list[Node], routes: list[list[Node]]) -> None:
     """Sort a layer by the mean position of each node's neighbours in the layer before."""
-    places = {one.name: float(at) for at, one in enumerate(before)}
+    places = {node.name: float(at) for at, node in enumerate(before)}
     near: dict[str, list[float]] = defaultdict(list)
     for route in routes:
         for a, b in pairwise(route):
@@ -287,16 +287,16 @@ def _place(graph: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
     for sweep in range(160):
         for layer in layers[:: 1 if sweep % 2 == 0 else -1]:
             wanted = [_mean([beside[o] for o in near[one.name]], beside[one.name]) for one in layer]
-            _separate(layer, wanted, beside, {one.name: size[one.name][0] for one in layer})
+            _separate(layer, wanted, beside, {node.name: size[node.name][0] for node in layer})
     low = min(beside[node.name] - size[node.name][0] / 2 for node in graph.nodes)
     along = 2.0
     for layer in layers:
-        depth = max(size[one.name][1] for one in layer)
-        for one in layer:
+        depth = max(size[node.name][1] for node in layer)
+        for node in layer:
             # A layer without labels has no depth; its edges pass the middle of the gap.
             middle = along + (depth / 2 if depth else -BETWEEN / 2)
-            places = beside[one.name] - low + 2.0, middle
-            one.x, one.y = places[::-1] if across else places
+            places = beside[node.name] - low + 2.0, middle
+            node.x, node.y = places[::-1] if across else places
         along += depth + (BETWEEN if depth else 0.0)
     graph.width = max(node.x + node.width / 2 for node in graph.nodes) + 2.0
     graph.height = max(node.y + node.height / 2 for node in graph.nodes) + 2.0
@@ -352,7 +352,7 @@ def svg_of(diagram: Diagram, identity: str) -> str:
 
 def _curve(route: list[Node], across: bool) -> str:
     """Return a smooth path through the centres of the nodes, from border to border."""
-    points = [(one.x, one.y) for one in route]
+    points = [(node.x, node.y) for node in route]
     sign = 1.0 if route[-1].layer > route[0].layer else -1.0
     for at, direction in ((0, sign), (-1, -sign)):
         x, y = points[at]

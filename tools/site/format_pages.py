@@ -52,10 +52,10 @@ def formats_module() -> str:
     rows = "".join(
         f"  {json.dumps(row)},\n"
         for kind in _DASHBOARD
-        for one in formats_of(kind)
-        if kind != "map" or one.name not in clouds
-        for row in [{"kind": kind, "name": one.name, "title": one.title,
-                     "suffixes": one.suffixes, "signature": one.signature}]
+        for file_format in formats_of(kind)
+        if kind != "map" or file_format.name not in clouds
+        for row in [{"kind": kind, "name": file_format.name, "title": file_format.title,
+                     "suffixes": file_format.suffixes, "signature": file_format.signature}]
     )  # fmt: skip
     return (
         "// The formats of files, written by `make goldens` from sceneprint_client/formats.py.\n"

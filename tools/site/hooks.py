@@ -91,22 +91,22 @@ def _navigation_entries(generated: list[GeneratedPage]) -> list[Any]:
     """Return the entries of generated pages; those of a group are below the group's name."""
     entries: list[Any] = []
     groups: dict[str, list[Any]] = {}
-    for one in generated:
-        if not one.group:
-            entries.append({one.title: one.path})
+    for page in generated:
+        if not page.group:
+            entries.append({page.title: page.path})
             continue
-        if one.group not in groups:
-            groups[one.group] = []
-            entries.append({one.group: groups[one.group]})
-        first = one.path.endswith("/index.md")  # the group's own page
-        groups[one.group].append(one.path if first else {one.title: one.path})
+        if page.group not in groups:
+            groups[page.group] = []
+            entries.append({page.group: groups[page.group]})
+        first = page.path.endswith("/index.md")  # the group's own page
+        groups[page.group].append(page.path if first else {page.title: page.path})
     return entries
 
 
 def with_generated(index: str, generated: list[GeneratedPage]) -> str:
     """Return the index with rows for the generated pages at the end of its section Reference."""
     rows = "\n".join(
-        f"| [{one.title}]({one.path}) | {one.about} |" for one in generated if one.about
+        f"| [{page.title}]({page.path}) | {page.about} |" for page in generated if page.about
     )
     head, mark, rest = index.partition(f"\n## {REFERENCE}\n")
     section, other, tail = rest.partition("\n## ")
@@ -130,7 +130,7 @@ def with_figures(text: str, page: str) -> str:
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Set the navigation, and anchors in the style of git hosts."""
     generated = generated_pages()
-    _Build.pages = {one.path: one for one in generated}
+    _Build.pages = {page.path: page for page in generated}
     config.nav = navigation_of((ROOT / INDEX).read_text(encoding="utf-8"), generated)
     config.mdx_configs.setdefault("toc", {})["slugify"] = heading_anchor
     return config

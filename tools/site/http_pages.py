@@ -69,14 +69,14 @@ def resource_page(name: str, document: Json) -> str:
     return page(
         f"# {name.capitalize()}",
         _overview(own, ""),
-        *(_describe(one) for one in own),
+        *(_describe(row) for row in own),
     )
 
 
 def index_page(document: Json) -> str:
     """Return Markdown that lists all operations by resource."""
     result = operations(document)
-    names = sorted({one.resource for one in result})
+    names = sorted({item.resource for item in result})
     return page(
         "# HTTP API",
         f"{len(result)} operations. Bodies and answers are described with the "
@@ -86,7 +86,7 @@ def index_page(document: Json) -> str:
         *(
             page(
                 f"## {name.capitalize()}",
-                _overview([one for one in result if one.resource == name], f"{name}.md"),
+                _overview([item for item in result if item.resource == name], f"{name}.md"),
             )
             for name in names
         ),
@@ -96,10 +96,10 @@ def index_page(document: Json) -> str:
 def _overview(own: list[Operation], file: str) -> str:
     rows = (
         (
-            f"[{code(f'{one.method} {one.path}')}]({file}#{one.anchor})",
-            cell(first_sentence(one.body.get("description", one.title))),
+            f"[{code(f'{row.method} {row.path}')}]({file}#{row.anchor})",
+            cell(first_sentence(row.body.get("description", row.title))),
         )
-        for one in own
+        for row in own
     )
     return table(("operation", "what it does"), rows)
 
@@ -189,7 +189,7 @@ def records_page(document: Json) -> str:
 
 
 def _record(name: str, schema: Json) -> str:
-    values = ", ".join(code(str(one)) for one in schema.get("enum", ()))
+    values = ", ".join(code(str(value)) for value in schema.get("enum", ()))
     return page(
         f"## {_record_title(name)} {{ #{_record_anchor(name)} }}",
         plain(schema.get("description", "")),
@@ -246,10 +246,10 @@ def _name_of(schema: Json) -> str:
     if "const" in schema:
         return code(str(schema["const"]))
     if "enum" in schema:
-        return " or ".join(code(str(one)) for one in schema["enum"])
+        return " or ".join(code(str(value)) for value in schema["enum"])
     for key in ("anyOf", "oneOf", "allOf"):
         if key in schema:
-            return " or ".join(type_of(one) for one in schema[key])
+            return " or ".join(type_of(value) for value in schema[key])
     kind = schema.get("type", "anything")
     if kind == "array":
         return _array(schema)

@@ -43,7 +43,7 @@ class House:
         return list(fsck(self.settings, **how))
 
     def kinds(self, **how):
-        return [one.kind for one in self.look(**how)]
+        return [finding.kind for finding in self.look(**how)]
 
     def files(self):
         """Return the checksum of every file, and the names of folders."""
@@ -110,7 +110,7 @@ class House:
 def add_products(engine):
     """Add a job of `hall` with two files, and a tile; returns the job's id and the blobs."""
     job, _ = engine.begin_task("reconstruct", "hall", {})
-    blobs = [engine.store.blobs.put(one) for one in (b"a picture", b"a mesh", b"cells")]
+    blobs = [engine.store.blobs.put(data) for data in (b"a picture", b"a mesh", b"cells")]
     picture = JobFile("picture.png", blobs[0], 9, "image/png")
     mesh = JobFile("mesh.ply", blobs[1], 6, "model/ply")
     with engine.store.database.write() as connection:

@@ -73,7 +73,7 @@ def test_a_lost_blob_is_named_and_repaired(house, lost, kind, condition):
     assert not path.exists()
     assert house.quarantined() == ([damaged] if moved else [])
     # what is left to do is a worker's, or a robot's
-    known = [(one.kind, one.severity) for one in house.look()]
+    known = [(finding.kind, finding.severity) for finding in house.look()]
     assert known == ([(f"missing-{kind}", "note")] if kind in ("upload", "artifact") else [])
     with Engine(house.settings) as engine, engine.store.database.read() as connection:
         if kind == "job-file":
@@ -94,13 +94,13 @@ def test_a_repair_looks_again_before_it_writes(house, lost):
     house.damage(house.blob(house.sql("SELECT blob FROM frames WHERE number = 2")[0][0]))
     with Engine(house.settings) as engine:
         actual = list(check_frames(Folder(house.settings, engine.store), [1, 2]))
-        assert [one.kind for one in actual] == ["stale-value", "missing-upload", "damaged-upload"]
+        assert [item.kind for item in actual] == ["stale-value", "missing-upload", "damaged-upload"]
         (house.place / "away").rename(path)
         house.sql("UPDATE frames SET pose_x = pose_x - 1 WHERE number = 1")
         engine.delete_frame("hall", str(actual[2].frame_id))
         engine.purging.now()
         before = house.sql("SELECT * FROM frames ORDER BY number")
-        assert [one.repair and one.repair() for one in actual] == [GONE] * 3
+        assert [item.repair and item.repair() for item in actual] == [GONE] * 3
     assert house.sql("SELECT * FROM frames ORDER BY number") == before
     assert house.quarantined() == []
 
@@ -186,12 +186,12 @@ def test_a_repair_removes_nothing_under_a_backup(house):
         house.damage(house.blob(blob))
         with engine.store.blobs.locks.block_removals():
             actual = house.look(repair=True)
-            assert [one.left for one in actual] == [True, True]
-            assert all("a backup or another process" in str(one.error) for one in actual)
+            assert [item.left for item in actual] == [True, True]
+            assert all("a backup or another process" in str(item.error) for item in actual)
         assert stray.exists()
         assert house.blob(blob).exists()
         assert house.sql("SELECT reason FROM frames WHERE id = ?", frame_id) == [(None,)]
-        assert [one.left for one in house.look(repair=True)] == [False, False]
+        assert [finding.left for finding in house.look(repair=True)] == [False, False]
     assert not stray.exists()
 
 
@@ -237,7 +237,7 @@ def test_blobs_beside_a_database_that_knows_no_frame_are_left_alone(house):
     for path in there:
         age(path, 7200)
     actual = house.look(repair=True)
-    assert {(one.path, one.kind, one.severity, one.done) for one in actual} == {
+    assert {(item.path, item.kind, item.severity, item.done) for item in actual} == {
         (str(path), "unreferenced-file", "note", None) for path in there
     }
     assert all(path.exists() for path in there)

@@ -27,7 +27,7 @@ def test_an_index_that_contradicts_its_table_keeps_all_hands_off(house):
         before = house.files()
         actual = house.look(repair=True)
         assert actual[0].kind == "damaged-database"
-        assert all(one.done is None for one in actual)
+        assert all(item.done is None for item in actual)
         now = house.files()
         assert {k: v for k, v in now.items() if "sceneprint.db" not in k} == {
             k: v for k, v in before.items() if "sceneprint.db" not in k
@@ -39,7 +39,7 @@ def test_a_row_that_refers_to_none_keeps_all_hands_off(house):
     actual = house.look(repair=True)
     assert actual[0].kind == "dangling-row"
     assert actual[0].what == "row 1 of table maps"
-    assert all(one.done is None for one in actual)
+    assert all(item.done is None for item in actual)
     assert house.sql("SELECT COUNT(*) FROM signatures") == [(13,)]
 
 
@@ -52,7 +52,7 @@ def test_a_damaged_model_that_ships_is_put_back(house):
     house.sql("UPDATE models SET content = ? WHERE name = 'depth'", bytes(damaged))
     (actual,) = house.look()
     assert (actual.kind, actual.left) == ("damaged-model", True)
-    assert [one.left for one in house.look(repair=True)] == [False]
+    assert [finding.left for finding in house.look(repair=True)] == [False]
     assert house.sql("SELECT content FROM models WHERE name = 'depth'") == [(sound,)]
     assert house.look() == []
 
@@ -77,7 +77,7 @@ def test_an_empty_folder_of_blobs_is_not_taken_for_the_loss_of_all(house):
     with pytest.raises(UnusableStore, match="has no uploads"):
         house.look(repair=True)
     assert house.sql("SELECT state, reason FROM frames ORDER BY number") == before
-    assert {one.kind for one in house.look()} >= {"missing-upload"}  # looking goes on
+    assert {finding.kind for finding in house.look()} >= {"missing-upload"}  # looking goes on
 
 
 def test_a_quick_look_sees_what_is_missing(house):
@@ -86,7 +86,7 @@ def test_a_quick_look_sees_what_is_missing(house):
     )
     house.blob(blob).unlink()
     house.blob(other).write_bytes(b"other bytes")
-    actual = [one.kind for one in house.look(quick=True)]
+    actual = [finding.kind for finding in house.look(quick=True)]
     assert actual == ["missing-upload"]
 
 
@@ -104,10 +104,10 @@ def test_a_log_that_was_not_emptied_is_read_and_left(house, tmp_path):
     }
     other = type(house)(killed)
     before = other.files()
-    assert {one.kind for one in other.look()} == {"stale-value"}
+    assert {finding.kind for finding in other.look()} == {"stale-value"}
     assert other.files() == before
     (killed / "data" / "sceneprint.db-shm").unlink()  # as in a copy
-    assert {one.kind for one in other.look()} == {"stale-value"}
+    assert {finding.kind for finding in other.look()} == {"stale-value"}
     now = other.files()
     assert now.pop("data/sceneprint.db-shm", None)
     assert now == {k: v for k, v in before.items() if not k.endswith("-shm")}

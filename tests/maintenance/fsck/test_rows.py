@@ -72,7 +72,7 @@ def test_a_fault_is_named_and_repaired(house, fault):
         house.sql(change)
     before = house.files()
     actual = faults(house.look())
-    assert [one.kind for one in actual] == [kind]
+    assert [item.kind for item in actual] == [kind]
     assert actual[0].frame_id
     assert actual[0].left
     assert house.files() == before
@@ -89,7 +89,7 @@ def test_what_a_map_is_counted_to_hold(house):
     [actual] = house.look()
     assert (actual.kind, actual.map) == ("stale-value", "hall")
     assert f"usage is {before[0][0] + 1} frames with {before[0][1]} bytes" in actual.means
-    assert [one.left for one in house.look(repair=True)] == [False]
+    assert [finding.left for finding in house.look(repair=True)] == [False]
     assert (house.sql(statement), house.look()) == (before, [])
 
 
@@ -131,7 +131,7 @@ def test_a_damaged_signature_is_made_again(house, truth, uploads):
         numbers.append(5)
     house.sql("UPDATE frames SET novelty = 1.0 WHERE number = 1")  # others like it came since
     actual = house.look(repair=True)
-    assert [(one.kind, one.done) for one in actual] == [
+    assert [(item.kind, item.done) for item in actual] == [
         ("damaged-signature", "a worker signs it again from its upload")
     ] * len(numbers)
     assert house.look() == []
@@ -141,6 +141,6 @@ def test_a_damaged_signature_is_made_again(house, truth, uploads):
     assert others
     assert not others & {frame_id for (frame_id,) in rows}
     assert set(house.work()) == {"succeeded"}
-    assert [one for one in house.sql(statement) if one[0] <= 13] == [o for o in sound if o[0] <= 13]
+    assert [row for row in house.sql(statement) if row[0] <= 13] == [o for o in sound if o[0] <= 13]
     assert house.look() == []
     assert house.answers(uploads[:12]) == truth
