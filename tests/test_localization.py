@@ -74,7 +74,7 @@ def signer():
 
 @pytest.fixture(scope="module")
 def blank(room_frames, signer):
-    """A query's artifact where the map is not asked: any."""
+    """Return any artifact, for queries that are not compared with the map."""
     return prepare(room_frames[0], signer)[1]
 
 

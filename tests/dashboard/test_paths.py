@@ -44,7 +44,7 @@ def apart(station, until):
 
 @pytest.mark.thorough
 def test_runs_are_joined_from_here(page, apart, station, settle):
-    """Before and after: what nothing joins is told, and then drawn where the join says."""
+    """The page reports runs without a join, and draws them in place once a join exists."""
     urls = []
     page.on("request", lambda one: urls.append(urlsplit(one.url)))
     page.goto(apart["url"])

@@ -92,7 +92,7 @@ def test_a_spot_names_the_frames_that_saw_it(page, station, built, settle, axe, 
 
 @pytest.fixture(scope="module")
 def patrolled(station):
-    """A map that two robots asked: spot was found twice, cart once, and then not any more."""
+    """Send queries of two robots: spot is found twice, cart once and then not found."""
     path = station.make_map("patrolled")
     for sent in station.frames[:3]:
         form = sent.form(priority="10")

@@ -148,7 +148,7 @@ def test_mutations():
 
 
 def test_a_compressed_depth_message_of_ros():
-    """A header of 12 bytes before the PNG: its size is told, and its samples are read."""
+    """Size and samples are read from a PNG behind a header of 12 bytes."""
     samples = np.arange(1, 49, dtype=np.uint16).reshape(6, 8)
     camera = Intrinsics(8, 6, 10, 10, 4, 3)
     for unset in (bytes(8), struct.pack("<ff", 4.5e-41, 0.0), struct.pack("<ff", 1.0, 0.0)):

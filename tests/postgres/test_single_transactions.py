@@ -127,7 +127,7 @@ def test_what_fails_leaves_nothing(server_store, row):
     assert named(server_store) == "hall"
     assert locks(server_store) == 0
     with database.write(map_number=row.number, single=True):
-        pass  # nothing was asked: nothing has begun
+        pass  # no statement was sent, so no transaction has begun
     edit(database, row, "after")
     assert named(server_store) == "after"
 

@@ -91,7 +91,7 @@ def test_what_cannot_be_asked_again(served, original, shots, refused):
         ({"maps": ["again"], "query_id": "0" * 32}, "unknown-query"),
     ):
         refused(served.client.post("/v1/queries", json=body), 404, kind)
-    # without validation no points were made: they cannot be validated, or drawn
+    # without validation there are no points to validate or draw
     form = shots[0].form()
     form["data"]["stages"] = "retrieve"
     bare = served.client.post("/v1/maps/again/queries", **form).json()["query_id"]

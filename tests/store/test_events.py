@@ -111,7 +111,7 @@ def test_events_are_counted_by_interval(store):
 
 
 def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):
-    """Nor is it told of one that is already deleted it was made, and of which there is no other."""
+    """A key created at `since` gets no events of a map that had been deleted by then."""
 
     def changes(since, *names):
         wanted = EventFilter(frozenset(names), since=since)
@@ -155,7 +155,7 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):
     assert changes(250, "shop") == changes(250, "attic") == []
     assert changes(150, "shop") == [("map.created", "shop"), ("map.deleted", "shop")]
     assert changes(250, "hall", "shop", "yard") == [created, ("map.created", "yard")]
-    end("hall")  # by whoever had it: what was before it stays hidden
+    end("hall")  # events before its creation stay hidden
     at(400)
     assert changes(250, "hall") == [created, gone]
     assert changes(500, "hall") == []

@@ -126,7 +126,7 @@ def test_what_was_put_is_held_without_asking_until_something_is_removed(postgres
     digest = mine.blobs.put(b"depth")
     objects.delete(f"blobs/{digest[:2]}/{digest}")  # past all locks: nobody can know
     assert mine.blobs.holds(digest)  # not asked
-    assert not theirs.blobs.holds(digest)  # asked: another process put it
+    assert not theirs.blobs.holds(digest)  # checks the store, since another process wrote it
     mine.blobs.put(b"depth")
     with theirs.blobs.locks.removing() as allowed:
         assert allowed
