@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -150,7 +151,7 @@ class DecoderProcess:
 
         Parameters
         ----------
-        seconds : maximum processor time; the task may take eight times as long in all
+        seconds : maximum processor time, and maximum idle time
 
         Raises
         ------
@@ -199,7 +200,11 @@ class DecoderProcess:
         begun, self._until = self._cpu_s(), time.monotonic() + longest_s
         waiting = select.poll()
         waiting.register(self._socket, select.POLLIN)
+        asleep_s = 0.0
         while not waiting.poll(1e3 * _LOOK_S):
+            asleep_s = asleep_s + _LOOK_S if self._is_asleep() else 0.0
+            if asleep_s > cpu_s:
+                raise DecoderFailure(f"its decoder has been idle for {cpu_s:g} s")
             if self._cpu_s() - begun > cpu_s or time.monotonic() > self._until:
                 raise DecoderFailure(f"it takes longer than {cpu_s:g} s to decode")
         (size,) = struct.unpack("<I", self._read(4))
@@ -232,6 +237,13 @@ class DecoderProcess:
         with suppress(OSError):  # if the process has ended, the socket reports it
             return time.clock_gettime((~self._process.pid << 3) | 2)
         return 0.0
+
+    def _is_asleep(self) -> bool:
+        """Return whether the process is neither runnable nor waiting for a disk."""
+        with suppress(OSError):
+            stat = Path(f"/proc/{self._process.pid}/stat").read_text()
+            return stat.rpartition(")")[2].split()[0] not in ("R", "D")
+        return False
 
     def _cause(self) -> str:
         self._process.kill()  # it may have closed only the socket; an earlier exit code remains

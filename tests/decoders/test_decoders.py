@@ -94,7 +94,7 @@ def test_memory_is_limited(pool):
 
 
 @pytest.mark.parametrize(
-    ("task", "reason"), [("hang", r"longer than 0\.5 s"), ("sleep", r"longer than 0\.5 s")]
+    ("task", "reason"), [("hang", r"longer than 0\.5 s"), ("sleep", r"idle for 0\.5 s")]
 )
 def test_time_is_limited_of_work_and_of_sleep(pool, task, reason):
     with pytest.raises(errors.DecoderFailure, match=reason):
